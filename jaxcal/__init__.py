@@ -1,0 +1,61 @@
+"""jaxcal: calibrate event cameras, frame cameras and IMUs jointly. Every public name is reachable from here."""
+
+import importlib
+import importlib.metadata
+from typing import TYPE_CHECKING, Any
+
+import jax
+
+# Estimation is in double precision; this is the one place that says so.
+jax.config.update("jax_enable_x64", True)
+
+# name -> module that defines it; imported when first asked for, so that `import jaxcal` stays quick.
+_EXPORTS = {
+    "CalibrationError": "jaxcal.errors",
+    "Detections": "jaxcal.observations",
+    "Events": "jaxcal.observations",
+    "Frames": "jaxcal.observations",
+    "ImuNoise": "jaxcal.observations",
+    "ImuRecording": "jaxcal.observations",
+    "AprilGrid": "jaxcal.targets",
+    "Checkerboard": "jaxcal.targets",
+    "Target": "jaxcal.targets",
+    "load_target": "jaxcal.targets",
+    "CameraModel": "jaxcal.cameras",
+    "camera_model": "jaxcal.cameras",
+    "load_imu": "jaxcal.recording",
+    "load_rig": "jaxcal.recording",
+    "detect": "jaxcal.detection",
+    "calibrate_cameras": "jaxcal.calibration",
+    "calibrate_camera_imu": "jaxcal.calibration",
+    "Calibration": "jaxcal.results",
+    "load_calibration": "jaxcal.results",
+    "run_pipeline": "jaxcal.pipeline",
+}
+
+__all__ = [*sorted(_EXPORTS), "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import calibrate_camera_imu, calibrate_cameras
+    from jaxcal.cameras import CameraModel, camera_model
+    from jaxcal.detection import detect
+    from jaxcal.errors import CalibrationError
+    from jaxcal.observations import Detections, Events, Frames, ImuNoise, ImuRecording
+    from jaxcal.pipeline import run_pipeline
+    from jaxcal.recording import load_imu, load_rig
+    from jaxcal.results import Calibration, load_calibration
+    from jaxcal.targets import AprilGrid, Checkerboard, Target, load_target
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return importlib.metadata.version("jaxcal")
+    if name in _EXPORTS:
+        value = getattr(importlib.import_module(_EXPORTS[name]), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'jaxcal' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -1,0 +1,44 @@
+"""Camera models by name: Kalibr's names for the built-in ones, a dotted path for a user's own."""
+
+import difflib
+import importlib
+
+from jaxcal.cameras import pinhole
+from jaxcal.cameras.base import CameraModel
+from jaxcal.errors import CalibrationError
+
+_MODELS: dict[str, type[CameraModel]] = {model.name: model for model in pinhole.BUILT_IN}
+
+
+def names() -> list[str]:
+    """The names of all built-in models."""
+    return sorted(_MODELS)
+
+
+def camera_model(name: str) -> type[CameraModel]:
+    """The model class called `name`: a Kalibr name such as 'pinhole-radtan', or 'mypackage.mymodule:MyCamera'.
+
+    Raises CalibrationError when there is no such model.
+    """
+    if name in _MODELS:
+        return _MODELS[name]
+    if ":" in name:
+        module_name, _, class_name = name.partition(":")
+        try:
+            found = getattr(importlib.import_module(module_name), class_name)
+        except (ImportError, AttributeError) as error:
+            raise CalibrationError(
+                f"camera model '{name}': {error}. Expected 'module:Class' that Python can import from here."
+            ) from error
+        if not (isinstance(found, type) and issubclass(found, CameraModel)):
+            raise CalibrationError(f"camera model '{name}': {class_name} is not a subclass of jaxcal.CameraModel.")
+        return found
+    close = difflib.get_close_matches(name, names(), n=1)
+    hint = f" Did you mean '{close[0]}'?" if close else ""
+    raise CalibrationError(f"camera model '{name}' is unknown.{hint} Known: {', '.join(names())}, or 'module:Class'.")
+
+
+def model_name(model: CameraModel | type[CameraModel]) -> str:
+    """The name under which `camera_model` finds this model again."""
+    cls = model if isinstance(model, type) else type(model)
+    return cls.name if cls.name in _MODELS else f"{cls.__module__}:{cls.__qualname__}"

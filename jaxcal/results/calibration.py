@@ -1,0 +1,121 @@
+"""`Calibration`: what came out of a calibration, with its uncertainty and everything needed to judge it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxcal.cameras import CameraModel
+from jaxcal.errors import CalibrationError
+from jaxcal.observations import Detections
+from jaxcal.targets import Target
+
+
+@dataclass(frozen=True)
+class CameraCalibration:
+    """One calibrated camera.
+
+    `T_cn_cnm1` (4, 4) maps points from the previous camera's frame (None for the first); `T_cam_imu` (4, 4) and
+    `timeshift_cam_imu` (s, t_imu = t_cam + shift) are None without an IMU. `residuals_px` (M, 2) is projection minus
+    measurement for each corner of `detections`, NaN where the corner took no part (frame outside the IMU's time,
+    say); `inlier` (M,) is False for corners that were rejected. `corner_sigma_px` is the noise of one corner
+    coordinate, estimated from the residuals; `reprojection_rms_px` the root mean square 2-D error of the inliers.
+    """
+
+    name: str
+    model: CameraModel
+    image_size: tuple[int, int]
+    T_cn_cnm1: np.ndarray | None
+    T_cam_imu: np.ndarray | None
+    timeshift_cam_imu: float | None
+    detections: Detections
+    residuals_px: np.ndarray
+    inlier: np.ndarray
+    corner_sigma_px: float
+
+    @property
+    def reprojection_rms_px(self) -> float:
+        kept = self.residuals_px[self.inlier]
+        return float(np.sqrt(np.mean(np.sum(kept**2, axis=1)))) if len(kept) else float("nan")
+
+
+@dataclass(frozen=True)
+class ImuCalibration:
+    """How the IMU agrees with the estimated motion; all arrays at the IMU samples used, `t_s` (N,) seconds since `origin_ns`.
+
+    `gyro_rad_s`, `accel_m_s2` (N, 3) measured; `gyro_predicted`, `accel_predicted` (N, 3) from the spline, biases
+    included; `gyro_bias`, `accel_bias` (N, 3) the biases there, `gyro_bias_std`, `accel_bias_std` (N, 3) their 1-sigma
+    (or None); `gyro_sigma`, `accel_sigma` the discrete noise assumed, rad/s and m/s^2. `position_m` (N, 3) and
+    `rotation` (N, 3, 3) are the IMU's pose in the target frame (T_target_imu).
+    """
+
+    origin_ns: int
+    t_s: np.ndarray
+    gyro_rad_s: np.ndarray
+    accel_m_s2: np.ndarray
+    gyro_predicted: np.ndarray
+    accel_predicted: np.ndarray
+    gyro_bias: np.ndarray
+    accel_bias: np.ndarray
+    gyro_sigma: float
+    accel_sigma: float
+    position_m: np.ndarray
+    rotation: np.ndarray
+    noise: Mapping[str, float]
+    knot_rate_hz: float
+    spline_order: int
+    gyro_bias_std: np.ndarray | None = None
+    accel_bias_std: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibration of cameras, and of an IMU where there is one.
+
+    `blocks` names the rows of `covariance` (P, P), in order, with their sizes: 'cam0.intrinsics',
+    'cam0.distortion', 'cam1.T_cn_cnm1' (rotation x y z in rad, then translation x y z in m, both as a perturbation on
+    the left: R = Exp(dr) R0, t = t0 + dt, in the frame of the camera), 'cam0.T_cam_imu' likewise,
+    'cam0.timeshift_cam_imu' (s), 'gravity' (m/s^2, target frame). Held parameters have zero variance.
+
+    `gravity` (3,) is the acceleration of free fall in the target frame (it points down), None without an IMU.
+    `convergence` is the cost after each iteration of the last solve; `warnings` are sentences for a person;
+    `settings` and `versions` say how to get this result again.
+    """
+
+    cameras: tuple[CameraCalibration, ...]
+    target: Target
+    gravity: np.ndarray | None
+    imu: ImuCalibration | None
+    blocks: tuple[tuple[str, int], ...]
+    covariance: np.ndarray
+    convergence: np.ndarray
+    warnings: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def _slice(self, name: str) -> slice:
+        start = 0
+        for block, size in self.blocks:
+            if block == name:
+                return slice(start, start + size)
+            start += size
+        known = ", ".join(block for block, _ in self.blocks)
+        raise CalibrationError(f"no parameter is called '{name}'. This calibration has: {known}.")
+
+    def std(self, name: str) -> np.ndarray:
+        """1-sigma of a parameter block such as 'cam0.intrinsics', in the block's units (see the class)."""
+        rows = self._slice(name)
+        return np.sqrt(np.maximum(np.diag(self.covariance)[rows], 0.0))
+
+    def covariance_of(self, *names: str) -> np.ndarray:
+        """Joint covariance of the named blocks, in the order given."""
+        index = np.concatenate([np.arange(*self._slice(name).indices(len(self.covariance))) for name in names])
+        return self.covariance[np.ix_(index, index)]
+
+    def save(self, folder: str | Path) -> None:
+        """Write Kalibr-style yaml, `results.txt` and `calibration.npz` (everything; `load_calibration` reads it)."""
+        from jaxcal.results.files import save_calibration
+
+        save_calibration(self, Path(folder))
