@@ -1,0 +1,44 @@
+"""Shared fixtures: the real recordings, and loud deselection of their tests where they are absent."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+def _data_folder() -> Path | None:
+    value = os.environ.get("JAXCAL_DATA")
+    return Path(value).resolve() if value else None
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    folder = _data_folder()
+    if folder is not None and not folder.is_dir():
+        raise pytest.UsageError(f"JAXCAL_DATA is {folder}, which is not a folder.")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if _data_folder() is not None:
+        return
+    real = [item for item in items if item.get_closest_marker("real_data")]
+    if real:
+        config.hook.pytest_deselected(items=real)
+        items[:] = [item for item in items if not item.get_closest_marker("real_data")]
+        config.stash[_DESELECTED] = len(real)
+
+
+_DESELECTED = pytest.StashKey[int]()
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    count = config.stash.get(_DESELECTED, 0)
+    if count:
+        terminalreporter.write_sep("!", f"{count} tests on REAL DATA deselected: set JAXCAL_DATA to the data folder")
+
+
+@pytest.fixture(scope="session")
+def data_folder() -> Path:
+    """The folder of real recordings."""
+    folder = _data_folder()
+    assert folder is not None, "tests that use this fixture are marked real_data"
+    return folder
