@@ -1,0 +1,121 @@
+"""Images with times from folders: EuRoC/ASL, or files named by their time in nanoseconds."""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from jaxcal.errors import CalibrationError
+from jaxcal.observations import Frames
+from jaxcal.recording.yaml_files import located
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
+_EXPECTED = "Expected an EuRoC/ASL folder (data.csv beside data/) or image files named by their time in ns."
+
+
+@dataclass(frozen=True)
+class ImageFiles:
+    """Grey images by index, read from their files when asked for; holds only paths, so it is cheap to send around.
+
+    `paths` one file each; `image_size` (width, height) that each must have. Raises CalibrationError on reading a
+    missing or damaged file or one of another size.
+    """
+
+    paths: tuple[Path, ...]
+    image_size: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        path = self.paths[index]
+        image = read_grey(path)
+        height, width = image.shape
+        if (width, height) != self.image_size:
+            raise CalibrationError(
+                f"{path}: the image is {width}x{height} pixels, but the first one of this camera is "
+                f"{self.image_size[0]}x{self.image_size[1]}. All images of a camera must have one size."
+            )
+        return image
+
+
+def read_grey(path: Path) -> np.ndarray:
+    """A grey uint8 image (H, W) from a file, as stored (a camera's rotation tag is ignored: pixels are what counts).
+
+    Raises CalibrationError when the file is missing or cannot be decoded.
+    """
+    try:
+        encoded = np.fromfile(path, dtype=np.uint8)
+    except OSError as error:
+        raise CalibrationError(f"{path}: the image cannot be read ({error.strerror}). Copy it again.") from error
+    image = None
+    if encoded.size:
+        try:
+            image = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        except cv2.error:
+            image = None
+    if image is None:
+        raise CalibrationError(
+            f"{path}: not a readable image ({encoded.size} bytes). It is truncated or damaged: copy it again, or "
+            "remove it and its line in data.csv."
+        )
+    return image
+
+
+def load_frames(folder: str | Path) -> Frames:
+    """The images of one camera with their times, read lazily.
+
+    `folder` is an EuRoC/ASL camera folder (`data.csv` with lines 'time in ns, file name', and `data/`), or a bare
+    folder of images named `<time in ns>.png`. Raises CalibrationError when there are no images, a file that data.csv
+    names is missing, a name is no time, or times do not increase.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise CalibrationError(f"{folder}: no such image folder. {_EXPECTED}")
+    listing = folder / "data.csv"
+    times, paths = _listed(listing) if listing.is_file() else _named_by_time(folder)
+    first = read_grey(paths[0])
+    image_size = (first.shape[1], first.shape[0])
+    with located(str(folder)):
+        return Frames(np.array(times, dtype=np.int64), ImageFiles(tuple(paths), image_size), image_size)
+
+
+def _listed(listing: Path) -> tuple[list[int], list[Path]]:
+    folder = listing.parent / "data"
+    present = {entry.name for entry in folder.iterdir()} if folder.is_dir() else set()
+    times: list[int] = []
+    paths: list[Path] = []
+    with listing.open(newline="", encoding="utf-8") as file:
+        for number, row in enumerate(csv.reader(file), start=1):
+            if not row or row[0].lstrip().startswith("#") or (number == 1 and not row[0].strip().isdigit()):
+                continue
+            if len(row) < 2 or not row[0].strip().isdigit():
+                raise CalibrationError(
+                    f"{listing}: line {number} is '{','.join(row)}'; expected 'time in whole ns,file name'."
+                )
+            name = row[1].strip()
+            if name not in present:
+                raise CalibrationError(
+                    f"{folder / name}: no such image, but line {number} of {listing} names it. Copy the recording "
+                    "again, or remove the line."
+                )
+            times.append(int(row[0]))
+            paths.append(folder / name)
+    if not paths:
+        raise CalibrationError(f"{listing}: no images are listed. {_EXPECTED}")
+    return times, paths
+
+
+def _named_by_time(folder: Path) -> tuple[list[int], list[Path]]:
+    data = folder / "data"
+    source = data if data.is_dir() else folder
+    found = [path for path in source.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+    for path in sorted(found):
+        if not path.stem.isdigit():
+            raise CalibrationError(f"{path}: the name is not a time in whole nanoseconds. {_EXPECTED}")
+    if not found:
+        raise CalibrationError(f"{folder}: there are no images in this folder. {_EXPECTED}")
+    found.sort(key=lambda path: int(path.stem))
+    return [int(path.stem) for path in found], found

@@ -1,0 +1,157 @@
+"""rig.yaml: what a good one gives, and what each mistake says."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import yaml
+
+from jaxcal import AprilGrid, CalibrationError, Detections, load_rig
+
+TARGET = {"target_type": "aprilgrid", "tagRows": 6, "tagCols": 6, "tagSize": 0.088, "tagSpacing": 0.3}
+NOISE = {
+    "accelerometer_noise_density": 1.4e-3,
+    "accelerometer_random_walk": 8.6e-5,
+    "gyroscope_noise_density": 8.0e-5,
+    "gyroscope_random_walk": 2.2e-6,
+}
+
+
+@pytest.fixture
+def content(tmp_path: Path) -> dict[str, Any]:
+    """A rig with each kind of camera; its files lie beside it."""
+    (tmp_path / "target.yaml").write_text(yaml.safe_dump(TARGET))
+    (tmp_path / "imu.yaml").write_text(yaml.safe_dump(NOISE))
+    (tmp_path / "imu.csv").write_text("1,0,0,0,0,0,9.8\n2,0,0,0,0,0,9.8\n")
+    (tmp_path / "cam1").mkdir()
+    for t in (1, 2):
+        cv2.imwrite(str(tmp_path / "cam1" / f"{t}.png"), np.zeros((4, 6), np.uint8))
+    with h5py.File(tmp_path / "events.h5", "w") as file:
+        for name in "xypt":
+            file[name] = np.arange(4)
+    table = {"left_ns": np.array([1]), "left_point": np.array([2]), "left_uv": np.array([[3.0, 4.0]])}
+    np.savez(tmp_path / "table.npz", **table)
+    return {
+        "target": "target.yaml",
+        "cameras": [
+            {"name": "cam0", "model": "pinhole-radtan", "events": "events.h5", "resolution": [640, 480]},
+            {"name": "cam1", "model": "pinhole-equi", "frames": "cam1"},
+            {
+                "name": "cam2",
+                "model": "pinhole-radtan",
+                "detections": "table.npz",
+                "prefix": "left",
+                "resolution": [9, 9],
+            },
+        ],
+        "imu": {"data": "imu.csv", "noise": "imu.yaml"},
+        "reconstruction": {"window_ms": 20, "network": None},
+    }
+
+
+def write(folder: Path, content: Any) -> Path:
+    (folder / "rig.yaml").write_text(yaml.safe_dump(content))
+    return folder / "rig.yaml"
+
+
+def test_every_kind_of_camera_opens(tmp_path: Path, content: dict[str, Any]) -> None:
+    rig = load_rig(write(tmp_path, content))
+    assert rig.target == AprilGrid(rows=6, cols=6, tag_size=0.088, tag_spacing=0.3)
+    assert [camera.model for camera in rig.cameras] == ["pinhole-radtan", "pinhole-equi", "pinhole-radtan"]
+    with rig.cameras[0].open_events() as events:
+        assert len(events) == 4
+    assert len(rig.cameras[1].load_frames()) == 2
+    corners = rig.cameras[2].load_detections(rig.target)
+    assert isinstance(corners, Detections)
+    assert corners.pixels.tolist() == [[3.0, 4.0]]
+    assert rig.imu is not None
+    assert len(rig.imu.load()) == 2
+    assert rig.reconstruction.window_ms == 20.0
+    for camera, ask in ((1, "open_events"), (0, "load_frames")):
+        with pytest.raises(CalibrationError, match=f"camera 'cam{camera}' has no"):
+            getattr(rig.cameras[camera], ask)()
+
+
+def test_inline_target_and_noise(tmp_path: Path, content: dict[str, Any]) -> None:
+    filed = load_rig(write(tmp_path, content))
+    inline = load_rig(write(tmp_path, content | {"target": TARGET, "imu": {"data": "imu.csv", "noise": NOISE}}))
+    assert filed == inline
+
+
+def test_the_imu_and_reconstruction_are_optional(tmp_path: Path, content: dict[str, Any]) -> None:
+    del content["imu"], content["reconstruction"]
+    rig = load_rig(write(tmp_path, content))
+    assert rig.imu is None
+    assert rig.reconstruction.window_ms is None
+
+
+def change(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    """A function that sets (or, for None, removes) the value at a dotted path."""
+
+    def apply(content: Any) -> None:
+        *parents, last = [int(part) if part.isdigit() else part for part in path.split(".")]
+        for part in parents:
+            content = content[part]
+        if value is None:
+            del content[last]
+        else:
+            content[last] = value
+
+    return apply
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("camera", [], "unknown key 'camera'. Did you mean 'cameras'"),
+        ("target", None, "'target' is missing"),
+        ("target", "absent.yaml", "rig.yaml: target: .*absent.yaml does not exist"),
+        ("target", {**TARGET, "tagsize": 1}, "rig.yaml: target: unknown key 'tagsize'. Did you mean 'tagSize'"),
+        ("cameras", [], r"rig.yaml: cameras: expected a list of cameras, at least one"),
+        ("cameras", {"cam0": 1}, "expected a list of cameras"),
+        ("cameras.0", "cam0", r"cameras\[0\]: expected 'key: value' lines"),
+        ("cameras.0.event", "events.h5", r"rig.yaml: cameras\[0\]: unknown key 'event'. Did you mean 'events'"),
+        ("cameras.0.events", None, r"cameras\[0\]: give exactly one of .*; found none"),
+        ("cameras.0.frames", "cam1", "found events and frames"),
+        ("cameras.0.resolution", None, r"cameras\[0\]: an event recording needs the sensor's 'resolution"),
+        ("cameras.0.resolution", [640], r"cameras\[0\].resolution: expected \[width, height\]"),
+        ("cameras.0.resolution", [640, 480.5], "expected .width, height. in pixels"),
+        ("cameras.0.name", "a/b", "leave out slashes"),
+        ("cameras.0.model", 3, r"cameras\[0\].model: expected a text, found 3"),
+        ("cameras.0.prefix", "cam0", r"cameras\[0\].prefix: only a camera with 'detections'"),
+        ("cameras.1.name", "cam0", r"cameras\[1\].name: 'cam0' is the name of cameras\[0\] too"),
+        ("cameras.1.frames", "cam9", r"cameras\[1\].frames: .*cam9 does not exist"),
+        ("imu.nois", "imu.yaml", "rig.yaml: imu: unknown key 'nois'. Did you mean 'noise'"),
+        ("imu.data", None, "imu: 'data' is missing"),
+        ("imu.noise", {**NOISE, "gyroscope_noise_density": "x"}, "imu.noise: gyroscope_noise_density: expected a pos"),
+        ("reconstruction.window", 20, "reconstruction: unknown key 'window'. Did you mean 'window_ms'"),
+        ("reconstruction.window_ms", 0, "reconstruction.window_ms: expected a positive number"),
+        ("reconstruction.network", "absent.safetensors", "reconstruction.network: .* does not exist"),
+    ],
+)
+def test_mistakes_are_named(tmp_path: Path, content: dict[str, Any], path: str, value: Any, message: str) -> None:
+    change(path, value)(content)
+    with pytest.raises(CalibrationError, match=message):
+        load_rig(write(tmp_path, content))
+
+
+def test_files_that_are_no_rig(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"absent.yaml: no such rig file"):
+        load_rig(tmp_path / "absent.yaml")
+    (tmp_path / "broken.yaml").write_text("cameras: [")
+    with pytest.raises(CalibrationError, match="not a readable yaml file"):
+        load_rig(tmp_path / "broken.yaml")
+    (tmp_path / "text.yaml").write_text("hello")
+    with pytest.raises(CalibrationError, match="expected 'key: value' lines"):
+        load_rig(tmp_path / "text.yaml")
+
+
+def test_image_size_against_the_rig(tmp_path: Path, content: dict[str, Any]) -> None:
+    content["cameras"][1]["resolution"] = [640, 480]
+    rig = load_rig(write(tmp_path, content))
+    with pytest.raises(CalibrationError, match="the images are 6x4, but the rig says 640x480 for 'cam1'"):
+        rig.cameras[1].load_frames()
