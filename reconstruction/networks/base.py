@@ -1,0 +1,31 @@
+"""What every reconstruction network offers to the reconstructor."""
+
+import abc
+from typing import Any
+
+import torch
+from torch import nn
+
+# What a network remembers between windows: one entry per recurrent unit, a tensor or (LSTM) a pair of them.
+State = list[Any]
+
+
+class ReconstructionNetwork(nn.Module, abc.ABC):
+    """Voxel grids in, images out, with a state carried from window to window.
+
+    `num_bins` time bins of the voxel grid it reads; `multiple`: input height and width must be divisible by it;
+    `settings`: the numbers and names it was built from, as they stand in a checkpoint; `reduced_precision`: whether
+    it was trained to work in bfloat16.
+    """
+
+    num_bins: int
+    multiple: int
+    settings: dict[str, Any]
+    reduced_precision: bool = False
+
+    @abc.abstractmethod
+    def forward(self, voxels: torch.Tensor, state: State | None) -> tuple[torch.Tensor, State]:
+        """Image (B, 1, H, W), dark 0 to bright 1, at the end of the window, and the state for the next one.
+
+        `voxels` (B, num_bins, H, W) normalised voxel grids; `state` None at the start of a recording.
+        """
