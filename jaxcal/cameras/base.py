@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -62,7 +62,7 @@ class CameraModel(eqx.Module):
         """All parameters as one vector (n,), fields in order of their definition."""
         return jnp.concatenate([jnp.ravel(jnp.asarray(getattr(self, f.name), dtype=jnp.float64)) for f in _fields(self)])
 
-    def with_parameters(self, parameters: Float[Array, " n"]) -> Self:
+    def with_parameters(self, parameters: Float[Array, " n"]) -> "CameraModel":
         """The same model with another parameter vector (n,)."""
         values, start = [], 0
         for field in _fields(self):
@@ -87,7 +87,7 @@ class CameraModel(eqx.Module):
         return self.parameters[self.num_intrinsics :]
 
     @classmethod
-    def create(cls, intrinsics: Any, distortion: Any = ()) -> Self:
+    def create(cls, intrinsics: Any, distortion: Any = ()) -> "CameraModel":
         """Build the model from its intrinsics and distortion, as a Kalibr yaml gives them."""
         vector = np.concatenate([np.ravel(intrinsics), np.ravel(distortion)]).astype(np.float64)
         template = cls.from_focal(1.0, (2, 2))
@@ -101,7 +101,7 @@ class CameraModel(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def from_focal(cls, focal: float, image_size: tuple[int, int]) -> Self:
+    def from_focal(cls, focal: float, image_size: tuple[int, int]) -> "CameraModel":
         """A first model: focal length in pixels, principal point at the image's centre, no distortion."""
 
     # --- what follows from `project` ---------------------------------------------------------------------------------
@@ -123,7 +123,7 @@ class CameraModel(eqx.Module):
         # Points outside the forward half start on its rim: the equidistant guess is meant for fisheyes.
         start = jnp.where(radius < 1.4, start, jnp.append(tangent / radius, 0.15))
 
-        def step(_: int, ray: Array) -> Array:
+        def step(_: Any, ray: Array) -> Array:
             error = self.project(ray) - pixel
             jacobian = jax.jacfwd(self.project)(ray)
             # Minimum-norm step; the radial direction is in the null space of the projection's Jacobian.

@@ -1,6 +1,6 @@
 """Pinhole projection, with a distortion applied on the normalised image plane."""
 
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -28,7 +28,7 @@ class _Pinhole(CameraModel):
         return self.focal * self._distort(point[:2] / depth) + self.centre
 
     @classmethod
-    def from_focal(cls, focal: float, image_size: tuple[int, int]) -> Self:
+    def from_focal(cls, focal: float, image_size: tuple[int, int]) -> "CameraModel":
         width, height = image_size
         return cls(
             focal=jnp.full(2, float(focal)),

@@ -1,1 +1,30 @@
-"""To be filled."""
+"""The engine: block-arrow least squares. Knows nothing of cameras or IMUs."""
+
+from jaxcal.estimation.block_arrow import (
+    BlockArrow,
+    BlockArrowFactor,
+    band_from_windows,
+    chain_from_windows,
+    factorise,
+)
+from jaxcal.estimation.descent import BlockArrowDescent, BlockStep, damped_step
+from jaxcal.estimation.losses import huber
+from jaxcal.estimation.problem import BlockArrowProblem, State
+from jaxcal.estimation.solver import BlockArrowLevenbergMarquardt, SolveResult, solve
+
+__all__ = [
+    "BlockArrow",
+    "BlockArrowDescent",
+    "BlockArrowFactor",
+    "BlockArrowLevenbergMarquardt",
+    "BlockArrowProblem",
+    "BlockStep",
+    "SolveResult",
+    "State",
+    "band_from_windows",
+    "chain_from_windows",
+    "damped_step",
+    "factorise",
+    "huber",
+    "solve",
+]
