@@ -1,5 +1,35 @@
 """Results: the `Calibration`, its files and its report."""
 
-from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["Calibration", "CameraCalibration", "ImuCalibration"]
+from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
+from jaxcal.results.files import load_calibration, save_calibration
+from jaxcal.results.kalibr import CamchainCamera, load_camchain
+from jaxcal.results.text import results_text
+from jaxcal.results.verdict import Verdict, judge
+
+if TYPE_CHECKING:
+    from jaxcal.results.report import write_report
+
+__all__ = [
+    "Calibration",
+    "CamchainCamera",
+    "CameraCalibration",
+    "ImuCalibration",
+    "Verdict",
+    "judge",
+    "load_calibration",
+    "load_camchain",
+    "results_text",
+    "save_calibration",
+    "write_report",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # The report needs matplotlib; a calibration does not.
+    if name == "write_report":
+        from jaxcal.results.report import write_report
+
+        return write_report
+    raise AttributeError(f"module 'jaxcal.results' has no attribute '{name}'")

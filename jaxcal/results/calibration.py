@@ -36,15 +36,21 @@ class CameraCalibration:
     corner_sigma_px: float
 
     @property
+    def used(self) -> np.ndarray:
+        """(M,) True for the corners that took part in the solution and were not rejected."""
+        return self.inlier & np.isfinite(self.residuals_px).all(axis=1)
+
+    @property
     def reprojection_rms_px(self) -> float:
-        kept = self.residuals_px[self.inlier]
+        kept = self.residuals_px[self.used]
         return float(np.sqrt(np.mean(np.sum(kept**2, axis=1)))) if len(kept) else float("nan")
 
 
 @dataclass(frozen=True)
 class ImuCalibration:
-    """How the IMU agrees with the estimated motion; all arrays at the IMU samples used, `t_s` (N,) seconds since `origin_ns`.
+    """How the IMU agrees with the estimated motion.
 
+    All arrays are at the IMU samples used, at `t_s` (N,) seconds since `origin_ns`.
     `gyro_rad_s`, `accel_m_s2` (N, 3) measured; `gyro_predicted`, `accel_predicted` (N, 3) from the spline, biases
     included; `gyro_bias`, `accel_bias` (N, 3) the biases there, `gyro_bias_std`, `accel_bias_std` (N, 3) their 1-sigma
     (or None); `gyro_sigma`, `accel_sigma` the discrete noise assumed, rad/s and m/s^2. `position_m` (N, 3) and

@@ -1,0 +1,248 @@
+"""Kalibr's yaml results: camchain and imu files, written as Kalibr writes them, and camchains read back."""
+
+import difflib
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from jaxcal.cameras import CameraModel, camera_model, model_name
+from jaxcal.errors import CalibrationError
+from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
+
+# (camera_model, distortion_model) pairs that Kalibr knows; other models are written as 'module:Class'.
+_KALIBR_MODELS = {
+    ("pinhole", "radtan"),
+    ("pinhole", "equi"),
+    ("pinhole", "fov"),
+    ("pinhole", "none"),
+    ("omni", "radtan"),
+    ("omni", "none"),
+    ("eucm", "none"),
+    ("ds", "none"),
+}
+_OWN_DISTORTION = "custom"  # stands where the distortion is part of a 'module:Class' model
+_CAMERA_KEYS = (
+    "T_cam_imu",
+    "T_cn_cnm1",
+    "cam_overlaps",
+    "camera_model",
+    "distortion_coeffs",
+    "distortion_model",
+    "intrinsics",
+    "resolution",
+    "rostopic",
+    "timeshift_cam_imu",
+)
+_NEEDED_KEYS = ("camera_model", "distortion_coeffs", "distortion_model", "intrinsics", "resolution")
+
+
+@dataclass(frozen=True)
+class CamchainCamera:
+    """One camera of a Kalibr camchain; transforms (4, 4) and the time offset (s) are None where the file has none."""
+
+    name: str
+    model: CameraModel
+    image_size: tuple[int, int]
+    T_cn_cnm1: np.ndarray | None
+    T_cam_imu: np.ndarray | None
+    timeshift_cam_imu: float | None
+    overlaps: tuple[int, ...]
+
+
+def camchain(calibration: Calibration) -> dict[str, Any]:
+    """The content of `camchain.yaml` (without an IMU) or `camchain-imucam.yaml`: 'cam0' .. 'camN' to their entries."""
+    overlaps = camera_overlaps(calibration.cameras)
+    return {f"cam{k}": _camera_entry(camera, overlaps[k]) for k, camera in enumerate(calibration.cameras)}
+
+
+def imu_entry(imu: ImuCalibration) -> dict[str, Any]:
+    """The content of Kalibr's resulting `imu.yaml`, with the noise densities that the calibration used."""
+    rate = imu.noise.get("update_rate")
+    if rate is None:
+        rate = 1.0 / float(np.median(np.diff(imu.t_s)))
+    entry = {
+        "T_i_b": np.eye(4).tolist(),
+        "accelerometer_noise_density": float(imu.noise["accel_noise_density"]),
+        "accelerometer_random_walk": float(imu.noise["accel_random_walk"]),
+        "gyroscope_noise_density": float(imu.noise["gyro_noise_density"]),
+        "gyroscope_random_walk": float(imu.noise["gyro_random_walk"]),
+        "model": "calibrated",
+        "rostopic": "/imu0",
+        "time_offset": 0.0,
+        "update_rate": float(rate),
+    }
+    return {"imu0": entry}
+
+
+def to_yaml(content: Mapping[str, Any]) -> str:
+    """Yaml text laid out as Kalibr's: keys in order of the alphabet, one matrix row a line, floats to the last bit."""
+    return yaml.safe_dump(dict(content), default_flow_style=None, width=math.inf, sort_keys=True)
+
+
+def camera_overlaps(cameras: tuple[CameraCalibration, ...]) -> list[list[int]]:
+    """For each camera the indices of the others that saw a target point at the same time (Kalibr's `cam_overlaps`).
+
+    Frames count as simultaneous within half of the longer frame interval of the two, on a common clock.
+    """
+    overlaps: list[list[int]] = [[] for _ in cameras]
+    for a in range(len(cameras)):
+        for b in range(a + 1, len(cameras)):
+            if _see_together(cameras[a], cameras[b]):
+                overlaps[a].append(b)
+                overlaps[b].append(a)
+    return overlaps
+
+
+def load_camchain(path: str | Path) -> tuple[CamchainCamera, ...]:
+    """Read a Kalibr `camchain.yaml` or `camchain-imucam.yaml`, in order of the cameras' numbers.
+
+    Raises CalibrationError when the file is missing, is not yaml, lacks a key or has an unknown one, or holds a
+    transform that is not rigid.
+    """
+    path = Path(path)
+    try:
+        content = yaml.safe_load(path.read_text())
+    except FileNotFoundError as error:
+        raise CalibrationError(
+            f"{path}: no such camchain file. Kalibr and jaxcal write one per calibration."
+        ) from error
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"{path}: not a yaml file that can be read: {error}") from error
+    if not isinstance(content, Mapping) or not content:
+        raise CalibrationError(f"{path}: expected a camchain, with a key 'cam0' and one for each further camera.")
+    for key in content:
+        if not re.fullmatch(r"cam\d+", str(key)):
+            raise CalibrationError(f"{path}: unknown key '{key}'. A camchain has the keys cam0, cam1, ... only.")
+    ordered = sorted(content, key=lambda key: int(key[3:]))
+    return tuple(_read_camera(str(key), content[key], f"{path}: {key}") for key in ordered)
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+def _camera_entry(camera: CameraCalibration, overlaps: list[int]) -> dict[str, Any]:
+    projection, distortion = _kalibr_model(camera.model)
+    entry: dict[str, Any] = {
+        "cam_overlaps": overlaps,
+        "camera_model": projection,
+        "distortion_coeffs": np.asarray(camera.model.distortion).tolist(),
+        "distortion_model": distortion,
+        "intrinsics": np.asarray(camera.model.intrinsics).tolist(),
+        "resolution": [int(size) for size in camera.image_size],
+        "rostopic": f"/{camera.name}/image_raw",
+    }
+    if camera.T_cam_imu is not None:
+        entry["T_cam_imu"] = np.asarray(camera.T_cam_imu).tolist()
+    if camera.T_cn_cnm1 is not None:
+        entry["T_cn_cnm1"] = np.asarray(camera.T_cn_cnm1).tolist()
+    if camera.timeshift_cam_imu is not None:
+        entry["timeshift_cam_imu"] = float(camera.timeshift_cam_imu)
+    return entry
+
+
+def _kalibr_model(model: CameraModel) -> tuple[str, str]:
+    projection, _, distortion = model_name(model).partition("-")
+    if (projection, distortion) in _KALIBR_MODELS:
+        return projection, distortion
+    return f"{type(model).__module__}:{type(model).__qualname__}", _OWN_DISTORTION
+
+
+def _see_together(a: CameraCalibration, b: CameraCalibration) -> bool:
+    times_a, times_b = _common_clock_ns(a), _common_clock_ns(b)
+    if not len(times_a) or not len(times_b):
+        return False
+    tolerance = max(_half_interval_ns(times_a), _half_interval_ns(times_b))
+    points_a, points_b = _points_by_frame(a), _points_by_frame(b)
+    for frame, points in points_a.items():
+        after = int(np.searchsorted(times_b, times_a[frame]))
+        for other in (after - 1, after):
+            near = 0 <= other < len(times_b) and abs(int(times_b[other]) - int(times_a[frame])) <= tolerance
+            if near and other in points_b and not points.isdisjoint(points_b[other]):
+                return True
+    return False
+
+
+def _common_clock_ns(camera: CameraCalibration) -> np.ndarray:
+    return camera.detections.timestamps_ns + round((camera.timeshift_cam_imu or 0.0) * 1e9)
+
+
+def _half_interval_ns(times_ns: np.ndarray) -> float:
+    return float(np.median(np.diff(times_ns))) / 2.0 if len(times_ns) > 1 else 0.0
+
+
+def _points_by_frame(camera: CameraCalibration) -> dict[int, set[int]]:
+    points: dict[int, set[int]] = {}
+    for frame, point in zip(camera.detections.frame.tolist(), camera.detections.point.tolist(), strict=True):
+        points.setdefault(frame, set()).add(point)
+    return points
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+def _read_camera(name: str, entry: Any, where: str) -> CamchainCamera:
+    if not isinstance(entry, Mapping):
+        raise CalibrationError(f"{where}: expected keys such as camera_model and intrinsics; found {entry!r}.")
+    for key in entry:
+        if key not in _CAMERA_KEYS:
+            close = difflib.get_close_matches(str(key), _CAMERA_KEYS, n=1)
+            hint = f" Did you mean '{close[0]}'?" if close else f" Known: {', '.join(_CAMERA_KEYS)}."
+            raise CalibrationError(f"{where}: unknown key '{key}'.{hint}")
+    missing = [key for key in _NEEDED_KEYS if key not in entry]
+    if missing:
+        raise CalibrationError(f"{where}: '{missing[0]}' is missing. A camera needs {', '.join(_NEEDED_KEYS)}.")
+    width, height = _numbers(entry["resolution"], (2,), f"{where}: resolution")
+    shift = entry.get("timeshift_cam_imu")
+    return CamchainCamera(
+        name=name,
+        model=_read_model(entry, where),
+        image_size=(int(width), int(height)),
+        T_cn_cnm1=_transform(entry, "T_cn_cnm1", where),
+        T_cam_imu=_transform(entry, "T_cam_imu", where),
+        timeshift_cam_imu=None if shift is None else float(_numbers(shift, (), f"{where}: timeshift_cam_imu")),
+        overlaps=tuple(int(k) for k in entry.get("cam_overlaps") or ()),
+    )
+
+
+def _read_model(entry: Mapping[str, Any], where: str) -> CameraModel:
+    projection, distortion = str(entry["camera_model"]), str(entry["distortion_model"])
+    intrinsics = _numbers(entry["intrinsics"], (-1,), f"{where}: intrinsics")
+    coefficients = _numbers(entry["distortion_coeffs"], (-1,), f"{where}: distortion_coeffs")
+    if distortion == "none" and ":" not in projection:
+        coefficients = np.zeros(0)  # Kalibr writes zeros or an empty list here
+    try:
+        model = camera_model(projection if ":" in projection else f"{projection}-{distortion}")
+        return model.create(intrinsics, coefficients)
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from error
+
+
+def _transform(entry: Mapping[str, Any], key: str, where: str) -> np.ndarray | None:
+    if key not in entry:
+        return None
+    matrix = _numbers(entry[key], (4, 4), f"{where}: {key}")
+    rotation = matrix[:3, :3]
+    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
+    if not rigid or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+        raise CalibrationError(
+            f"{where}: {key} is not a rigid transform. Expected a rotation and a translation, with 0 0 0 1 as last row."
+        )
+    return matrix
+
+
+def _numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise CalibrationError(f"{where} is {value!r}; expected numbers.") from error
+    fits = array.ndim == len(shape) and all(want in (-1, have) for want, have in zip(shape, array.shape, strict=True))
+    if not fits or not np.isfinite(array).all():
+        wanted = "x".join("n" if size < 0 else str(size) for size in shape) or "one"
+        raise CalibrationError(f"{where} is {value!r}; expected {wanted} finite number(s).")
+    return array

@@ -1,0 +1,227 @@
+"""The figures of one camera: where its corners were, and what its residuals look like."""
+
+import numpy as np
+from matplotlib.patches import Circle, Rectangle
+from scipy.stats import norm
+
+from jaxcal.results.calibration import CameraCalibration
+from jaxcal.results.coverage import corner_counts, coverage
+from jaxcal.results.report.drawing import (
+    ACCENT,
+    BAD,
+    INK,
+    MUTED,
+    POINT,
+    REJECTED,
+    WARN,
+    Picture,
+    X,
+    Y,
+    image_panel,
+    label,
+    legend,
+    note,
+    nothing_to_show,
+    panel,
+    to_svg,
+)
+
+_FIELD_CELLS = (16, 12)
+_FEWEST_FOR_MEAN = 4
+_RADIUS_BINS = 12
+
+
+def camera_pictures(camera: CameraCalibration, prefix: str) -> list[Picture]:
+    """All figures of a camera, in the order in which they are read; `prefix` is unique in the page."""
+    return [
+        _coverage_picture(camera, f"{prefix}-coverage"),
+        _scatter_picture(camera, f"{prefix}-scatter"),
+        _histogram_picture(camera, f"{prefix}-histogram"),
+        _field_picture(camera, f"{prefix}-field"),
+        _radial_picture(camera, f"{prefix}-radial"),
+        _frames_picture(camera, f"{prefix}-frames"),
+    ]
+
+
+def frame_rms(camera: CameraCalibration) -> tuple[np.ndarray, np.ndarray]:
+    """Frames (K,) with used corners and the root mean square 2-D error (K,) of those corners, px."""
+    used = camera.used
+    frames, place = np.unique(camera.detections.frame[used], return_inverse=True)
+    squares = np.sum(camera.residuals_px[used] ** 2, axis=1)
+    counts = np.bincount(place, minlength=len(frames))
+    return frames, np.sqrt(np.bincount(place, weights=squares, minlength=len(frames)) / np.maximum(counts, 1))
+
+
+def _coverage_picture(camera: CameraCalibration, prefix: str) -> Picture:
+    figure, axes = image_panel(camera.image_size)
+    counts = corner_counts(camera)
+    width, height = camera.image_size
+    down, across = counts.shape
+    for row, col in np.argwhere(counts == 0):
+        corner = (col * width / across - 0.5, row * height / down - 0.5)
+        axes.add_patch(Rectangle(corner, width / across, height / down, facecolor=WARN, edgecolor="none", alpha=0.22))
+    x, y = camera.detections.pixels[camera.used].T
+    axes.plot(x, y, ".", markersize=1.6, color=POINT, alpha=0.7, rasterized=True)
+    return Picture(
+        "Coverage",
+        to_svg(figure, prefix),
+        f"Every corner used ({len(x)}), over the image. Tinted cells saw none: {100 * coverage(camera):.0f} % of the "
+        "cells are covered.",
+        "points all over the image, into its edges and corners.",
+        "record more views with the target in the tinted places; distortion there is extrapolated.",
+    )
+
+
+def _scatter_picture(camera: CameraCalibration, prefix: str) -> Picture:
+    figure, (axes,) = panel()
+    sigma = camera.corner_sigma_px
+    used, rejected = camera.residuals_px[camera.used], _rejected(camera)
+    limit = 5.0 * sigma if sigma > 0 else 1.0
+    axes.plot(*used.T, ".", markersize=1.8, color=POINT, alpha=0.5, rasterized=True)
+    axes.plot(*rejected.T, "x", markersize=3.0, color=REJECTED, alpha=0.8, rasterized=True)
+    for factor, style in ((1.0, "-"), (3.0, "--")):
+        axes.add_patch(Circle((0.0, 0.0), factor * sigma, fill=False, edgecolor=INK, linewidth=1.0, linestyle=style))
+    axes.set_xlim(-limit, limit)
+    axes.set_ylim(-limit, limit)
+    axes.set_aspect("equal")
+    label(axes, "error in u [px]", "error in v [px]")
+    everything = np.concatenate([used, rejected])
+    beyond = int(np.sum(np.abs(everything).max(axis=1) > limit)) if len(everything) else 0
+    if beyond:
+        note(axes, f"{beyond} outside")
+    inside = float(np.mean(np.sum(used**2, axis=1) <= (3.0 * sigma) ** 2)) if len(used) else float("nan")
+    return Picture(
+        "Reprojection residuals",
+        to_svg(figure, prefix),
+        f"Projection minus measurement; circles at 1 and 3 sigma ({sigma:.3f} px), {100 * inside:.1f} % within 3 sigma "
+        f"(98.9 % if Gaussian); {len(rejected)} rejected corners in red.",
+        "one round cloud, centred on zero.",
+        "a long tail points to wrong detections, a stretched cloud to motion blur, several clouds to bad frames.",
+    )
+
+
+def _histogram_picture(camera: CameraCalibration, prefix: str) -> Picture:
+    figure, (axes,) = panel()
+    used = camera.residuals_px[camera.used]
+    if len(used) and camera.corner_sigma_px > 0:
+        edges = np.linspace(-5.0, 5.0, 51)
+        centres = (edges[1:] + edges[:-1]) / 2.0
+        for axis, (name, colour) in enumerate((("u", X), ("v", Y))):
+            density = np.histogram(used[:, axis] / camera.corner_sigma_px, edges)[0] / (len(used) * 0.2)
+            axes.step(centres, density, where="mid", color=colour, linewidth=1.2, label=name)
+        axes.plot(centres, norm.pdf(centres), "--", color=INK, linewidth=1.0, label="N(0, 1)")
+        legend(axes, loc="upper right")
+        axes.set_ylim(bottom=0.0)
+    else:
+        nothing_to_show(axes, "no corner used")
+    label(axes, "error / corner sigma", "density")
+    return Picture(
+        "Distribution",
+        to_svg(figure, prefix),
+        "Residuals of each coordinate over the corner noise, against the normal curve.",
+        "both lines on the dashed one.",
+        "a sharp peak with wide feet means that a few frames or corners are much worse than the others.",
+    )
+
+
+def _field_picture(camera: CameraCalibration, prefix: str) -> Picture:
+    figure, axes = image_panel(camera.image_size)
+    width, height = camera.image_size
+    across, down = _FIELD_CELLS
+    pixels, residuals = camera.detections.pixels[camera.used], camera.residuals_px[camera.used]
+    column = np.clip(((pixels[:, 0] + 0.5) / width * across).astype(int), 0, across - 1)
+    row = np.clip(((pixels[:, 1] + 0.5) / height * down).astype(int), 0, down - 1)
+    cell = row * across + column
+    counts = np.bincount(cell, minlength=across * down)
+    means = (
+        np.stack([np.bincount(cell, weights=residuals[:, k], minlength=across * down) for k in range(2)], axis=1)
+        / np.maximum(counts, 1)[:, None]
+    )
+    shown = counts >= _FEWEST_FOR_MEAN
+    if shown.any() and camera.corner_sigma_px > 0:
+        # One corner sigma is drawn as long as a cell is wide: systematic errors are read against the noise.
+        arrows = means[shown] / camera.corner_sigma_px * (width / across)
+        x = (np.arange(across * down)[shown] % across + 0.5) * width / across - 0.5
+        y = (np.arange(across * down)[shown] // across + 0.5) * height / down - 0.5
+        axes.quiver(
+            x, y, arrows[:, 0], arrows[:, 1], angles="xy", scale_units="xy", scale=1.0, color=ACCENT, width=0.0045
+        )
+    else:
+        nothing_to_show(axes, "too few corners for means")
+    largest = float(np.linalg.norm(means[shown], axis=1).max()) if shown.any() else float("nan")
+    return Picture(
+        "Mean residual over the image",
+        to_svg(figure, prefix),
+        f"Mean residual per cell; one corner sigma ({camera.corner_sigma_px:.3f} px) is drawn one cell long. "
+        f"The largest mean is {largest:.3f} px.",
+        "short arrows without order.",
+        "a pattern (a vortex, a ring, a shear) is error the lens model cannot express, or a board that is not flat.",
+    )
+
+
+def _radial_picture(camera: CameraCalibration, prefix: str) -> Picture:
+    figure, (axes,) = panel()
+    width, height = camera.image_size
+    pixels, residuals = camera.detections.pixels[camera.used], camera.residuals_px[camera.used]
+    arm = pixels - np.array([(width - 1) / 2.0, (height - 1) / 2.0])
+    radius = np.linalg.norm(arm, axis=1)
+    outward = np.sum(arm * residuals, axis=1) / np.maximum(radius, 1e-9)
+    edge = float(np.hypot(width, height) / 2.0)
+    place = np.clip((radius / edge * _RADIUS_BINS).astype(int), 0, _RADIUS_BINS - 1)
+    counts = np.bincount(place, minlength=_RADIUS_BINS)
+    shown = counts >= _FEWEST_FOR_MEAN
+    mean = np.bincount(place, weights=outward, minlength=_RADIUS_BINS) / np.maximum(counts, 1)
+    spread = np.bincount(place, weights=outward**2, minlength=_RADIUS_BINS) / np.maximum(counts, 1) - mean**2
+    error = np.sqrt(np.maximum(spread, 0.0) / np.maximum(counts, 1))
+    centre = (np.arange(_RADIUS_BINS) + 0.5) / _RADIUS_BINS * edge
+    sigma = camera.corner_sigma_px
+    axes.axhspan(-sigma, sigma, color=MUTED, alpha=0.15, linewidth=0.0)
+    axes.axhline(0.0, color=MUTED, linewidth=0.8)
+    if shown.any():
+        axes.errorbar(
+            centre[shown], mean[shown], 2.0 * error[shown], fmt="o-", color=ACCENT, markersize=3.0, linewidth=1.0
+        )
+    else:
+        nothing_to_show(axes, "too few corners for means")
+    limit = max(1.5 * sigma, 1.2 * float(np.abs(mean[shown]).max(initial=0.0)), 1e-6)
+    axes.set_ylim(-limit, limit)
+    axes.set_xlim(0.0, edge)
+    label(axes, "distance from the image's centre [px]", "outward error [px]")
+    return Picture(
+        "Residual along the radius",
+        to_svg(figure, prefix),
+        "Mean outward residual by distance from the centre, bars at 2 sigma of the mean; the band is the corner noise.",
+        "zero within the bars at every distance.",
+        "a wave means that the distortion model has too few terms for this lens: choose a richer one.",
+    )
+
+
+def _frames_picture(camera: CameraCalibration, prefix: str) -> Picture:
+    figure, (axes,) = panel()
+    frames, rms = frame_rms(camera)
+    times = camera.detections.timestamps_ns
+    expected = np.sqrt(2.0) * camera.corner_sigma_px
+    if len(frames):
+        seconds = (times[frames] - times[0]) * 1e-9
+        axes.plot(seconds, rms, "-", color=ACCENT, linewidth=0.7, alpha=0.5)
+        axes.plot(seconds, rms, ".", color=ACCENT, markersize=3.5)
+        worst = int(np.argmax(rms))
+        axes.plot(seconds[worst], rms[worst], "o", markersize=7.0, markerfacecolor="none", markeredgecolor=BAD)
+        axes.axhline(expected, color=INK, linestyle="--", linewidth=1.0)
+        axes.set_ylim(0.0, 1.12 * max(float(rms.max()), 1.2 * expected))
+        told = f"worst {rms[worst]:.2f} px at {seconds[worst]:.2f} s (ringed)"
+    else:
+        nothing_to_show(axes, "no corner used")
+        told = "no frame was used"
+    label(axes, "time [s]", "rms error of the frame [px]")
+    return Picture(
+        "Error over time",
+        to_svg(figure, prefix),
+        f"Root mean square error of each frame, {told}; dashed: what the corner noise explains ({expected:.3f} px).",
+        "a level line near the dashed one.",
+        "peaks that come with fast motion are blur or a wrong time offset; single frames are bad detections.",
+    )
+
+
+def _rejected(camera: CameraCalibration) -> np.ndarray:
+    return camera.residuals_px[~camera.inlier & np.isfinite(camera.residuals_px).all(axis=1)]

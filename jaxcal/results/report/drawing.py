@@ -1,0 +1,139 @@
+"""Drawing figures that take their colours from the page: matplotlib figures to SVG for use inside HTML."""
+
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+# Colours that stand for a CSS variable of the page and are exchanged for it in the SVG, so that one figure serves the
+# light and the dark page. Raster parts cannot do this: they use the fixed colours below, readable on either.
+_CSS_VARIABLES = {
+    "#010101": "--ink",
+    "#020202": "--muted",
+    "#030303": "--line",
+    "#040404": "--bad",
+    "#050505": "--axis-x",
+    "#060606": "--axis-y",
+    "#070707": "--axis-z",
+    "#080808": "--accent",
+    "#090909": "--usable",
+    "#0a0a0a": "--paper",
+}
+INK, MUTED, LINE, BAD, X, Y, Z, ACCENT, WARN, PAPER = _CSS_VARIABLES
+AXIS_COLOURS = (X, Y, Z)
+POINT = "#4f8fd9"  # for raster points
+REJECTED = "#e2574c"
+
+PANEL = (4.4, 3.3)  # inches; three abreast on a desk, one on a phone
+_FONT_SIZE = 9.0
+_RASTER_DPI = 180
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the report. `shows`, `good` and `otherwise` (what to do if it does not look so) form the caption."""
+
+    title: str
+    svg: str
+    shows: str
+    good: str
+    otherwise: str
+
+
+def panel(rows: int = 1, size: tuple[float, float] = PANEL) -> tuple[Figure, Sequence[Axes]]:
+    """A figure with `rows` axes below each other that share x, dressed in the report's colours."""
+    figure = Figure(figsize=size)
+    grid = figure.subplots(rows, 1, sharex=True, squeeze=False, gridspec_kw={"hspace": 0.12})[:, 0]
+    figure.subplots_adjust(left=0.14, right=0.975, top=0.97, bottom=0.145)
+    for axes in grid:
+        _dress(axes)
+    return figure, list(grid)
+
+
+def image_panel(image_size: tuple[int, int]) -> tuple[Figure, Axes]:
+    """A figure whose axes are an image's pixels: square, y downwards."""
+    figure, (axes,) = panel()
+    width, height = image_size
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_aspect("equal")
+    axes.grid(visible=False)
+    label(axes, "u [px]", "v [px]")
+    return figure, axes
+
+
+def label(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x, color=INK, fontsize=_FONT_SIZE)
+    axes.set_ylabel(y, color=INK, fontsize=_FONT_SIZE)
+
+
+def note(axes: Axes, text: str, x: float = 0.98, y: float = 0.97) -> None:
+    """A remark in a corner of the axes (position in fractions of the axes)."""
+    axes.text(
+        x,
+        y,
+        text,
+        transform=axes.transAxes,
+        ha="right" if x > 0.5 else "left",
+        va="top" if y > 0.5 else "bottom",
+        fontsize=_FONT_SIZE - 1.0,
+        color=INK,
+        bbox={"facecolor": PAPER, "edgecolor": "none", "alpha": 0.75, "pad": 1.5},
+    )
+
+
+def legend(axes: Axes, **options: object) -> None:
+    axes.legend(
+        **{
+            "fontsize": _FONT_SIZE - 1.0,
+            "labelcolor": INK,
+            "frameon": True,
+            "facecolor": PAPER,
+            "edgecolor": "none",
+            "framealpha": 0.75,
+            "borderpad": 0.2,
+            "handlelength": 1.4,
+            **options,
+        }  # pyright: ignore[reportArgumentType]
+    )
+
+
+def nothing_to_show(axes: Axes, text: str) -> None:
+    """Say in the middle of empty axes why they are empty."""
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=MUTED, fontsize=_FONT_SIZE)
+
+
+def to_svg(figure: Figure, prefix: str) -> str:
+    """The figure as an `<svg>` element that scales with the page; `prefix` keeps its ids apart from other figures'."""
+    buffer = io.StringIO()
+    # Text stays text (smaller, selectable); the salt makes ids, and so the page, the same in every run.
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "jaxcal"}):
+        figure.savefig(buffer, format="svg", transparent=True, dpi=_RASTER_DPI)
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
+    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg, count=1)
+    svg = re.sub(r'\bid="', f'id="{prefix}-', svg)
+    svg = svg.replace("url(#", f"url(#{prefix}-").replace('href="#', f'href="#{prefix}-')
+    return re.sub(r"#0[0-9a]0[0-9a]0[0-9a]\b", _variable, svg)
+
+
+def _variable(match: re.Match[str]) -> str:
+    name = _CSS_VARIABLES.get(match.group(0))
+    return f"var({name})" if name else match.group(0)
+
+
+def _dress(axes: Axes) -> None:
+    axes.set_facecolor("none")
+    for side, spine in axes.spines.items():
+        spine.set_color(LINE)
+        spine.set_linewidth(0.8)
+        spine.set_visible(side in ("left", "bottom"))
+    axes.tick_params(colors=MUTED, labelcolor=MUTED, labelsize=_FONT_SIZE - 1.0, length=3.0, width=0.8)
+    axes.grid(visible=True, color=LINE, linewidth=0.6, alpha=0.6)
+    axes.set_axisbelow(True)

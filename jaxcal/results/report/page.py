@@ -1,0 +1,124 @@
+"""`write_report`: one self-contained HTML page that says whether a calibration is good, and shows why."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from jaxcal.observations import Frames
+from jaxcal.progress import Progress, no_progress
+from jaxcal.results.atomic import write_text
+from jaxcal.results.calibration import Calibration
+from jaxcal.results.report.camera_figures import camera_pictures
+from jaxcal.results.report.drawing import ACCENT, Picture, label, nothing_to_show, panel, to_svg
+from jaxcal.results.report.frames import FramePicture, frame_pictures
+from jaxcal.results.report.imu_figures import imu_pictures
+from jaxcal.results.report.rig_figures import rig_pictures
+from jaxcal.results.report.tables import camera_tables, gravity_table, imu_facts
+from jaxcal.results.verdict import judge
+
+
+def write_report(
+    calibration: Calibration,
+    path: str | Path,
+    images: Mapping[str, Frames] | None = None,
+    progress: Progress = no_progress,
+) -> None:
+    """Write the report of a calibration to `path`, atomically, as a single HTML file without external references.
+
+    `images` are the frames in which the corners of a camera were found, by camera name; cameras without them are
+    reported without pictures of their detections. Raises CalibrationError when an image has not its camera's size.
+    """
+    stage = "report"
+    total = len(calibration.cameras) + 1
+    cameras = []
+    progress(stage, 0, total)
+    for index, camera in enumerate(calibration.cameras):
+        frames: list[FramePicture] = []
+        if images is not None and camera.name in images:
+            frames = frame_pictures(camera, images[camera.name])
+        cameras.append(
+            {
+                "id": f"camera-{index}",
+                "tables": camera_tables(calibration, index),
+                "frames": frames,
+                "pictures": camera_pictures(camera, f"c{index}"),
+            }
+        )
+        progress(stage, index + 1, total)
+    page = _template().render(**_content(calibration), cameras=cameras)
+    write_text(Path(path), page)
+    progress(stage, total, total)
+
+
+def _content(calibration: Calibration) -> dict[str, Any]:
+    imu = calibration.imu
+    rig = [] if imu is None and len(calibration.cameras) == 1 else rig_pictures(calibration, "rig")
+    return {
+        "title": _title(calibration),
+        "subtitle": _subtitle(calibration),
+        "verdict": judge(calibration),
+        "warnings": calibration.warnings,
+        "gravity": gravity_table(calibration),
+        "rig": rig,
+        "imu_pictures": [] if imu is None else imu_pictures(imu, "imu"),
+        "imu_facts": imu_facts(calibration),
+        "convergence": _convergence_picture(calibration, "convergence"),
+        "settings": _readable(calibration.settings),
+        "versions": _readable(calibration.versions),
+        "target": _readable(calibration.target.to_yaml()),
+    }
+
+
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("jaxcal.results.report", "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html.jinja")
+
+
+def _title(calibration: Calibration) -> str:
+    count = len(calibration.cameras)
+    cameras = "One camera" if count == 1 else f"{count} cameras"
+    return f"{cameras} and an IMU" if calibration.imu is not None else cameras
+
+
+def _subtitle(calibration: Calibration) -> str:
+    names = ", ".join(camera.name for camera in calibration.cameras)
+    corners = sum(int(camera.used.sum()) for camera in calibration.cameras)
+    return f"{names}; {corners:,} target corners used"
+
+
+def _readable(mapping: Mapping[str, Any]) -> list[tuple[str, str]]:
+    return [
+        (str(key), value if isinstance(value, str) else json.dumps(value, default=str))
+        for key, value in mapping.items()
+    ]
+
+
+def _convergence_picture(calibration: Calibration, prefix: str) -> Picture:
+    figure, (axes,) = panel()
+    cost = np.asarray(calibration.convergence, dtype=np.float64)
+    shown = np.isfinite(cost) & (cost > 0)
+    if shown.any():
+        axes.semilogy(np.arange(len(cost))[shown], cost[shown], "o-", color=ACCENT, markersize=3.5, linewidth=1.1)
+        axes.grid(visible=False, which="minor")
+        told = f"{len(cost) - 1} steps, from {cost[shown][0]:.4g} to {cost[shown][-1]:.4g}."
+    else:
+        nothing_to_show(axes, "no cost recorded")
+        told = "No cost was recorded."
+    label(axes, "step", "cost")
+    return Picture(
+        "Convergence",
+        to_svg(figure, prefix),
+        f"Cost after each step of the last solve: {told}",
+        "a fall that ends in a level stretch.",
+        "a curve that still falls at its end was stopped early; one that rises and falls met a poorly posed problem.",
+    )

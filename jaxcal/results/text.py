@@ -1,0 +1,176 @@
+"""`results.txt`: the calibration as text, in the order and words of Kalibr's, with 1-sigma beside the values."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxcal.cameras import model_name
+from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
+from jaxcal.results.parameters import sigma_of
+from jaxcal.targets import AprilGrid, Target
+
+
+def results_text(calibration: Calibration) -> str:
+    """The whole result as plain text, ending with a newline."""
+    sections = [_heading("Calibration results", "="), *_residuals(calibration), _cameras(calibration)]
+    if calibration.imu is not None:
+        sections += [_camera_to_imu(calibration, k) for k in range(len(calibration.cameras))]
+        sections += _gravity(calibration)
+    sections += [_heading("Calibration configuration", "=")]
+    sections += [_camera_configuration(camera) for camera in calibration.cameras]
+    if calibration.imu is not None:
+        sections += [_imu_configuration(calibration.imu)]
+    sections += [_target_configuration(calibration.target)]
+    if calibration.warnings:
+        sections += ["\n".join([_heading("Warnings", "="), *(f"- {warning}" for warning in calibration.warnings)])]
+    return "\n\n".join(sections) + "\n"
+
+
+def _heading(title: str, line: str) -> str:
+    return f"{title}\n{line * len(title)}"
+
+
+def _numbers(values: np.ndarray) -> str:
+    return np.array2string(np.asarray(values), precision=8, suppress_small=True, max_line_width=10_000)
+
+
+def _with_sigma(values: np.ndarray, sigma: np.ndarray | None) -> str:
+    return f"{_numbers(values)} +- {'unknown' if sigma is None else _numbers(sigma)}"
+
+
+def _statistics(label: str, norms: np.ndarray) -> str:
+    if not len(norms):
+        return f"{label:<38} none used"
+    return f"{label:<38} mean {norms.mean():.8g}, median {np.median(norms):.8g}, std: {norms.std():.8g}"
+
+
+def _residuals(calibration: Calibration) -> list[str]:
+    """Kalibr's two lists of norms: divided by the noise assumed, and in units."""
+    normalised = [_heading("Normalized Residuals", "-")]
+    plain = [_heading("Residuals", "-")]
+    for camera in calibration.cameras:
+        norms = np.linalg.norm(camera.residuals_px[camera.used], axis=1)
+        normalised.append(_statistics(f"Reprojection error ({camera.name}):", norms / camera.corner_sigma_px))
+        plain.append(_statistics(f"Reprojection error ({camera.name}) [px]:", norms))
+    imu = calibration.imu
+    if imu is not None:
+        gyro = np.linalg.norm(imu.gyro_rad_s - imu.gyro_predicted, axis=1)
+        accel = np.linalg.norm(imu.accel_m_s2 - imu.accel_predicted, axis=1)
+        normalised.append(_statistics("Gyroscope error (imu0):", gyro / imu.gyro_sigma))
+        normalised.append(_statistics("Accelerometer error (imu0):", accel / imu.accel_sigma))
+        plain.append(_statistics("Gyroscope error (imu0) [rad/s]:", gyro))
+        plain.append(_statistics("Accelerometer error (imu0) [m/s^2]:", accel))
+    return ["\n".join(normalised), "\n".join(plain)]
+
+
+def _cameras(calibration: Calibration) -> str:
+    lines = [_heading("Camera-system parameters (+- is 1-sigma)", "-")]
+    for camera in calibration.cameras:
+        kept = camera.residuals_px[camera.used]
+        spread = f"{_numbers(kept.mean(axis=0))} +- {_numbers(kept.std(axis=0))}" if len(kept) else "none used"
+        lines += [
+            f"{camera.name} (/{camera.name}/image_raw):",
+            f"    type: {model_name(camera.model)}",
+            "    distortion: "
+            + _with_sigma(np.asarray(camera.model.distortion), sigma_of(calibration, f"{camera.name}.distortion")),
+            "    projection: "
+            + _with_sigma(np.asarray(camera.model.intrinsics), sigma_of(calibration, f"{camera.name}.intrinsics")),
+            f"    reprojection error [px]: {spread} (rms of the 2-D error: {camera.reprojection_rms_px:.6f})",
+            f"    corners: {int(camera.used.sum())} used of {len(camera.detections)}, "
+            f"in {len(camera.detections.seen_frames)} frames",
+        ]
+    for k, camera in enumerate(calibration.cameras):
+        if camera.T_cn_cnm1 is not None:
+            lines += _baseline(calibration, k, camera.T_cn_cnm1)
+    return "\n".join(lines)
+
+
+def _baseline(calibration: Calibration, index: int, transform: np.ndarray) -> list[str]:
+    sigma = sigma_of(calibration, f"{calibration.cameras[index].name}.T_cn_cnm1")
+    quaternion = Rotation.from_matrix(transform[:3, :3]).as_quat()  # Kalibr prints x y z w
+    turn, shift = (None, None) if sigma is None else (sigma[:3], sigma[3:])
+    return [
+        f"baseline T_{index}_{index - 1}:",
+        f"    q: {_with_sigma(quaternion, turn)} (x y z w; the sigma is of a small rotation, rad)",
+        f"    t: {_with_sigma(transform[:3, 3], shift)} [m]",
+    ]
+
+
+def _camera_to_imu(calibration: Calibration, index: int) -> str:
+    camera = calibration.cameras[index]
+    lines = [_heading(f"Transformation ({camera.name}):", "-")]
+    if camera.T_cam_imu is not None:
+        sigma = sigma_of(calibration, f"{camera.name}.T_cam_imu")
+        lines += [
+            f"T_ci:  (imu0 to {camera.name}): ",
+            _numbers(camera.T_cam_imu),
+            f"    rotation sigma [rad]: {'unknown' if sigma is None else _numbers(sigma[:3])}",
+            f"    translation sigma [m]: {'unknown' if sigma is None else _numbers(sigma[3:])}",
+            "",
+            f"T_ic:  ({camera.name} to imu0): ",
+            _numbers(np.linalg.inv(camera.T_cam_imu)),
+        ]
+    if camera.timeshift_cam_imu is not None:
+        sigma = sigma_of(calibration, f"{camera.name}.timeshift_cam_imu")
+        lines += [
+            "",
+            f"timeshift {camera.name} to imu0: [s] (t_imu = t_cam + shift)",
+            f"{float(camera.timeshift_cam_imu)!r} +- {'unknown' if sigma is None else format(sigma[0], '.3g')}",
+        ]
+    return "\n".join(lines)
+
+
+def _gravity(calibration: Calibration) -> list[str]:
+    if calibration.gravity is None:
+        return []
+    sigma = sigma_of(calibration, "gravity")
+    return [f"Gravity vector in target coords: [m/s^2]\n{_with_sigma(calibration.gravity, sigma)}"]
+
+
+def _camera_configuration(camera: CameraCalibration) -> str:
+    projection, _, distortion = model_name(camera.model).partition("-")
+    return "\n".join(
+        [
+            _heading(camera.name, "-"),
+            f"  Camera model: {projection}",
+            f"  Projection parameters: {np.asarray(camera.model.intrinsics).tolist()}",
+            f"  Distortion model: {distortion or 'part of the camera model'}",
+            f"  Distortion coefficients: {np.asarray(camera.model.distortion).tolist()}",
+            f"  Resolution: {list(camera.image_size)}",
+            f"  Corner noise (1-sigma of a coordinate): {camera.corner_sigma_px:.6g} [px]",
+        ]
+    )
+
+
+def _imu_configuration(imu: ImuCalibration) -> str:
+    rate = imu.noise.get("update_rate") or 1.0 / float(np.median(np.diff(imu.t_s)))
+    return "\n".join(
+        [
+            _heading("IMU0", "-"),
+            "  Model: calibrated",
+            f"  Update rate: {rate:.6g}",
+            "  Accelerometer:",
+            f"    Noise density: {imu.noise['accel_noise_density']}",
+            f"    Noise density (discrete): {imu.accel_sigma}",
+            f"    Random walk: {imu.noise['accel_random_walk']}",
+            "  Gyroscope:",
+            f"    Noise density: {imu.noise['gyro_noise_density']}",
+            f"    Noise density (discrete): {imu.gyro_sigma}",
+            f"    Random walk: {imu.noise['gyro_random_walk']}",
+            f"  Spline: order {imu.spline_order}, {imu.knot_rate_hz:g} knots per second",
+        ]
+    )
+
+
+def _target_configuration(target: Target) -> str:
+    if isinstance(target, AprilGrid):
+        details = [
+            "  Type: aprilgrid",
+            "  Tags:",
+            f"    Rows: {target.rows}",
+            f"    Cols: {target.cols}",
+            f"    Size: {target.tag_size} [m]",
+            f"    Spacing {target.tag_size * target.tag_spacing} [m]",
+        ]
+    else:
+        details = [f"  {key}: {value}" for key, value in target.to_yaml().items()]
+    return "\n".join([_heading("Target configuration", "="), *details])
