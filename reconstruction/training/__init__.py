@@ -1,0 +1,1 @@
+"""Training of the default network on simulated calibration patterns: `python -m reconstruction.training`."""

@@ -1,0 +1,104 @@
+"""The training set: generated once, kept as two arrays on disk, read in random clips."""
+
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from jaxcal.progress import Progress, no_progress, track
+from reconstruction.training.recipe import DataRecipe, Stage, fingerprint
+from reconstruction.training.sequences import training_scene, windows
+from reconstruction.voxel import voxel_grid
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """`voxels` (sequences, windows, bins, size, size) float16 and `targets` (sequences, windows, size, size) float16,
+    both mapped from disk."""
+
+    voxels: np.ndarray
+    targets: np.ndarray
+
+    def clip(
+        self, rng: np.random.Generator, stage: Stage
+    ) -> tuple[Float[torch.Tensor, "t b c h w"], Float[torch.Tensor, "t b 1 h w"]]:
+        """A batch of random clips: windows first. Each is cropped, and turned or mirrored at random."""
+        count, length, size = self.voxels.shape[0], self.voxels.shape[1], self.voxels.shape[-1]
+        total = stage.windows * stage.segments
+        drawn = []
+        for sequence in rng.integers(count, size=stage.batch):
+            start = int(rng.integers(length - total + 1))
+            top, left = (int(v) for v in rng.integers(size - stage.crop + 1, size=2))
+            part = (
+                sequence,
+                slice(start, start + total),
+                ...,
+                slice(top, top + stage.crop),
+                slice(left, left + stage.crop),
+            )
+            drawn.append(_turned(rng, self.voxels[part], self.targets[part][:, None]))
+        voxels, targets = (np.stack(arrays, axis=1) for arrays in zip(*drawn, strict=True))
+        return torch.from_numpy(voxels).float(), torch.from_numpy(targets).float()
+
+
+def _turned(rng: np.random.Generator, *arrays: np.ndarray) -> list[np.ndarray]:
+    """One of the eight turns and mirrorings of a square, the same for all arrays (..., size, size)."""
+    turns, mirrored = int(rng.integers(4)), rng.random() < 0.5
+    turned = [np.rot90(array, turns, axes=(-2, -1)) for array in arrays]
+    return [np.ascontiguousarray(array[..., ::-1] if mirrored else array) for array in turned]
+
+
+def load_or_generate(recipe: DataRecipe, num_bins: int, cache: Path, progress: Progress = no_progress) -> Dataset:
+    """The training set, from `cache` if it is complete there; a set that is interrupted is continued."""
+    folder = cache / f"sequences-{fingerprint(recipe)}-{num_bins}"
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{index:04d}.npz" for index in range(recipe.sequences)]
+    for index, path in enumerate(track(paths, "simulate training sequences", len(paths), progress)):
+        if not path.exists():
+            _generate(recipe, num_bins, index, path)
+    return _merged(paths, folder)
+
+
+def _generate(recipe: DataRecipe, num_bins: int, index: int, path: Path) -> None:
+    rng = np.random.default_rng([recipe.seed, index])
+    scene = training_scene(rng, recipe.size, recipe.windows, recipe.checkerboards)
+    voxels, targets = [], []
+    for window in windows(scene, seed=index):
+        voxels.append(
+            voxel_grid(
+                window.x, window.y, window.t_us, window.p, width=recipe.size, height=recipe.size, num_bins=num_bins
+            )
+        )
+        targets.append(window.target)
+    partial = path.with_suffix(".part")
+    with partial.open("wb") as file:
+        np.savez(file, voxels=np.array(voxels, dtype=np.float16), targets=np.array(targets, dtype=np.float16))
+    os.replace(partial, path)
+
+
+def _merged(paths: list[Path], folder: Path) -> Dataset:
+    """One array file each for voxels and targets, so that clips can be cut from disk without reading sequences."""
+    names = ("voxels", "targets")
+    merged = {name: folder / f"{name}.npy" for name in names}
+    if not all(path.exists() for path in merged.values()):
+        with np.load(paths[0]) as first:
+            shapes = {name: (len(paths), *first[name].shape) for name in names}
+        partial = {name: folder / f"{name}.part.npy" for name in names}
+        arrays = {
+            name: np.lib.format.open_memmap(partial[name], mode="w+", dtype=np.float16, shape=shapes[name])
+            for name in names
+        }
+        for index, path in enumerate(paths):
+            with np.load(path) as sequence:
+                for name in names:
+                    arrays[name][index] = sequence[name]
+        for name in names:
+            arrays[name].flush()
+            os.replace(partial[name], merged[name])
+    return Dataset(*(np.load(merged[name], mmap_mode="r") for name in names))
