@@ -297,7 +297,8 @@ class Detections:
         if not path.exists():
             raise CalibrationError(f"{path}: no such detections file.")
         try:
-            with np.load(path, allow_pickle=False) as data:
+            # Opened here, because numpy leaves a file open that turns out to be damaged.
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
                 fields = {name: data[name] for name in ("timestamps_ns", "frame", "point", "pixels", "image_size")}
         except Exception as error:
             raise CalibrationError(

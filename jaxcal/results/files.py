@@ -53,7 +53,7 @@ def save_calibration(calibration: Calibration, folder: Path) -> None:
         write_text(folder / "imu.yaml", to_yaml(imu_entry(calibration.imu)))
     write_text(folder / "results.txt", results_text(calibration))
     content = io.BytesIO()
-    np.savez_compressed(content, **_arrays(calibration))
+    np.savez_compressed(content, **_arrays(calibration))  # pyright: ignore[reportArgumentType]
     write_bytes(folder / FILE_NAME, content.getvalue())
 
 
@@ -167,7 +167,8 @@ def _find(path: Path) -> Path:
 
 def _read_arrays(file: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(file, allow_pickle=False) as data:
+        # Opened here, because numpy leaves a file open that turns out to be damaged.
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
             return {name: data[name] for name in data.files}
     except Exception as error:  # numpy and zipfile raise many kinds on damaged files; all mean the same here
         raise CalibrationError(

@@ -253,7 +253,7 @@ def _imu_checks(imu: ImuCalibration) -> Iterator[Check]:
             imu.accel_m_s2 - imu.accel_predicted,
             imu.accel_sigma,
             imu.accel_bias,
-            "m/s^2",
+            "m/s²",
             _ACCEL_BIAS_M_S2,
         ),
     )
@@ -287,9 +287,9 @@ def _gravity_checks(calibration: Calibration) -> Iterator[Check]:
     yield Check(
         "gravity",
         "size",
-        f"{size:.3f} m/s^2",
+        f"{size:.3f} m/s²",
         f"9.81 within {_GRAVITY_M_S2[0]:g}",
         _above(abs(size - 9.81), _GRAVITY_M_S2),
-        f"gravity comes out as {size:.2f} m/s^2",
+        f"gravity comes out as {size:.2f} m/s²",
         "Check the accelerometer's units and the size of the target.",
     )

@@ -31,8 +31,10 @@ class Checkerboard(Target):
 
     def __post_init__(self) -> None:
         _check("Checkerboard", {"rows": self.rows, "cols": self.cols}, {"spacing": self.spacing})
-        if self.col_spacing is not None:
-            _check("Checkerboard", {}, {"col_spacing": self.col_spacing})
+        if self.col_spacing is None:
+            # One way to say it, so that a board equals itself after a round trip through yaml.
+            object.__setattr__(self, "col_spacing", self.spacing)
+        _check("Checkerboard", {}, {"col_spacing": self.col_spacing or 0.0})
         if min(self.rows, self.cols) < 2:
             raise CalibrationError("Checkerboard: at least 2 x 2 inner corners are needed; count the INNER corners.")
 

@@ -1,6 +1,7 @@
 """Calibrations made up from a seed: real projections with noise, a smooth motion and a plausible covariance."""
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -124,7 +125,7 @@ def _camera(
     rotation, position = _pose_target_imu(times_s)
     in_imu = np.einsum("fji,fnj->fni", rotation, target.points[None] - position[:, None])
     in_camera = in_imu @ T_cam_imu[index][:3, :3].T + T_cam_imu[index][:3, 3]
-    exact = np.asarray(model.project(in_camera))
+    exact = np.asarray(model.project(jnp.asarray(in_camera)))
     inside = (exact > 2).all(-1) & (exact < np.array([width - 3, height - 3])).all(-1) & (in_camera[..., 2] > 0.1)
     # A polynomial lens folds far outside its field of view; a detector would not see those points.
     inside &= np.hypot(in_camera[..., 0], in_camera[..., 1]) < 1.0 * in_camera[..., 2]

@@ -77,10 +77,13 @@ def _scatter_picture(camera: CameraCalibration, prefix: str) -> Picture:
     sigma = camera.corner_sigma_px
     used, rejected = camera.residuals_px[camera.used], _rejected(camera)
     limit = 5.0 * sigma if sigma > 0 else 1.0
-    axes.plot(*used.T, ".", markersize=1.8, color=POINT, alpha=0.5, rasterized=True)
+    faint = float(np.clip(4000.0 / max(len(used), 1), 0.08, 0.5))  # so that a dense cloud still shows its core
+    axes.plot(*used.T, ".", markersize=1.8, color=POINT, alpha=faint, rasterized=True)
     axes.plot(*rejected.T, "x", markersize=3.0, color=REJECTED, alpha=0.8, rasterized=True)
     for factor, style in ((1.0, "-"), (3.0, "--")):
-        axes.add_patch(Circle((0.0, 0.0), factor * sigma, fill=False, edgecolor=INK, linewidth=1.0, linestyle=style))
+        axes.add_patch(
+            Circle((0.0, 0.0), factor * sigma, fill=False, edgecolor=INK, linewidth=1.0, linestyle=style, zorder=4)
+        )
     axes.set_xlim(-limit, limit)
     axes.set_ylim(-limit, limit)
     axes.set_aspect("equal")

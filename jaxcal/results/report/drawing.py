@@ -48,9 +48,11 @@ def panel(rows: int = 1, size: tuple[float, float] = PANEL) -> tuple[Figure, Seq
     """A figure with `rows` axes below each other that share x, dressed in the report's colours."""
     figure = Figure(figsize=size)
     grid = figure.subplots(rows, 1, sharex=True, squeeze=False, gridspec_kw={"hspace": 0.12})[:, 0]
-    figure.subplots_adjust(left=0.14, right=0.975, top=0.97, bottom=0.145)
+    bottom = 0.145 * PANEL[1] / size[1]
+    figure.subplots_adjust(left=0.165, right=0.975, top=0.97, bottom=bottom)
     for axes in grid:
         _dress(axes)
+        axes.yaxis.set_label_coords(-0.165, 0.5)
     return figure, list(grid)
 
 
@@ -62,6 +64,9 @@ def image_panel(image_size: tuple[int, int]) -> tuple[Figure, Axes]:
     axes.set_ylim(height - 0.5, -0.5)
     axes.set_aspect("equal")
     axes.grid(visible=False)
+    axes.yaxis.set_label_coords(-0.15, 0.5)
+    for spine in axes.spines.values():
+        spine.set_visible(True)
     label(axes, "u [px]", "v [px]")
     return figure, axes
 

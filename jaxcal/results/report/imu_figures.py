@@ -23,6 +23,7 @@ from jaxcal.results.report.drawing import (
 _TALL = (4.4, 4.0)
 _ENVELOPE_BINS = 450
 _ZOOM_SAMPLES = 300
+_FIT_BINS = 80
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class _Sensor:
 
 
 def imu_pictures(imu: ImuCalibration, prefix: str) -> list[Picture]:
-    """Four figures for the gyroscope, then four for the accelerometer."""
+    """The motion and the residuals of gyroscope and accelerometer, then their biases and their fit over time."""
     gyro = _Sensor(
         "Gyroscope", "rad/s", imu.gyro_rad_s, imu.gyro_predicted, imu.gyro_sigma, imu.gyro_bias, imu.gyro_bias_std,
         imu.noise.get("gyro_random_walk"),
@@ -56,9 +57,13 @@ def imu_pictures(imu: ImuCalibration, prefix: str) -> list[Picture]:
             _whole_picture(sensor, imu.t_s, zoom, f"{prefix}-{name}-whole"),
             _zoom_picture(sensor, imu.t_s, zoom, f"{prefix}-{name}-zoom"),
             _histogram_picture(sensor, f"{prefix}-{name}-histogram"),
-            _bias_picture(sensor, imu.t_s, f"{prefix}-{name}-bias"),
         ]
-    return pictures
+    return [
+        *pictures,
+        _bias_picture(gyro, imu.t_s, f"{prefix}-gyro-bias"),
+        _bias_picture(accel, imu.t_s, f"{prefix}-accel-bias"),
+        _fit_picture((gyro, accel), imu.t_s, f"{prefix}-fit"),
+    ]
 
 
 def _liveliest(imu: ImuCalibration) -> slice:
@@ -180,4 +185,28 @@ def _bias_picture(sensor: _Sensor, t: np.ndarray, prefix: str) -> Picture:
         f"Estimated bias over time. {bands}Dashed: how far the stated random walk reaches from the start (3 sigma).",
         "slow lines that stay between the dashed ones.",
         "a bias that swings with the motion hides another error: noise figures, time offset, or the target's size.",
+    )
+
+
+def _fit_picture(sensors: tuple[_Sensor, _Sensor], t: np.ndarray, prefix: str) -> Picture:
+    figure, rows = panel(2, _TALL)
+    starts = np.arange(0, len(t), math.ceil(len(t) / _FIT_BINS))
+    lengths = np.diff(np.append(starts, len(t)))
+    for axes, sensor in zip(rows, sensors, strict=True):
+        squares = ((sensor.measured - sensor.predicted) / sensor.sigma) ** 2
+        for axis, colour in enumerate(AXIS_COLOURS):
+            rms = np.sqrt(np.add.reduceat(squares[:, axis], starts) / lengths)
+            axes.plot(t[starts], rms, color=colour, linewidth=1.0, label="xyz"[axis])
+        axes.axhline(1.0, color=INK, linestyle="--", linewidth=1.0)
+        axes.set_ylim(bottom=0.0)
+        label(axes, "", sensor.title)
+        axes.margins(x=0.01)
+    legend(rows[0], loc="lower right", ncols=3)
+    label(rows[1], "time [s]", sensors[1].title)
+    return Picture(
+        "Residuals over time",
+        to_svg(figure, prefix),
+        "Root mean square of residual over noise, in short stretches; dashed: 1, what the stated noise explains.",
+        "level lines about one, or below.",
+        "peaks with the motion ask for more knots per second; a single peak is a knock: cut that part out.",
     )

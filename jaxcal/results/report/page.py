@@ -17,7 +17,7 @@ from jaxcal.results.report.drawing import ACCENT, Picture, label, nothing_to_sho
 from jaxcal.results.report.frames import FramePicture, frame_pictures
 from jaxcal.results.report.imu_figures import imu_pictures
 from jaxcal.results.report.rig_figures import rig_pictures
-from jaxcal.results.report.tables import camera_tables, gravity_table, imu_facts
+from jaxcal.results.report.tables import camera_tables, check_rows, gravity_table, imu_facts
 from jaxcal.results.verdict import judge
 
 
@@ -56,11 +56,17 @@ def write_report(
 
 def _content(calibration: Calibration) -> dict[str, Any]:
     imu = calibration.imu
+    verdict = judge(calibration)
+    names = tuple(camera.name for camera in calibration.cameras)
+    others = tuple(dict.fromkeys(check.subject for check in verdict.checks if check.subject not in names))
     rig = [] if imu is None and len(calibration.cameras) == 1 else rig_pictures(calibration, "rig")
     return {
         "title": _title(calibration),
         "subtitle": _subtitle(calibration),
-        "verdict": judge(calibration),
+        "verdict": verdict,
+        "camera_names": names,
+        "camera_checks": check_rows(verdict.checks, names),
+        "other_checks": [(subject, check_rows(verdict.checks, (subject,))) for subject in others],
         "warnings": calibration.warnings,
         "gravity": gravity_table(calibration),
         "rig": rig,

@@ -1,14 +1,19 @@
 """The figures of the rig: where the cameras and the IMU sit, and how they moved before the target."""
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 
+from jaxcal.cameras import CameraModel
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
 from jaxcal.results.report.drawing import (
     ACCENT,
     AXIS_COLOURS,
     INK,
     MUTED,
+    PAPER,
     Picture,
     label,
     nothing_to_show,
@@ -42,6 +47,7 @@ def rig_poses(calibration: Calibration) -> tuple[list[np.ndarray], np.ndarray | 
 def rig_pictures(calibration: Calibration, prefix: str) -> list[Picture]:
     """Two views of the rig, and with an IMU its path before the target."""
     poses, T_cam0_imu = rig_poses(calibration)
+    rims = [_rim_rays(camera) for camera in calibration.cameras]
     views = (
         ("The rig, seen from behind and above", _OBLIQUE, "oblique", ("", "")),
         ("The rig from above", _FROM_ABOVE, "above", ("x of the first camera [m]", "z, forward [m]")),
@@ -49,7 +55,7 @@ def rig_pictures(calibration: Calibration, prefix: str) -> list[Picture]:
     pictures = []
     for title, view, name, names in views:
         figure, (axes,) = panel()
-        _draw_rig(axes, calibration.cameras, poses, T_cam0_imu, view)
+        _draw_rig(axes, calibration.cameras, rims, poses, T_cam0_imu, view)
         label(axes, *names)
         if view is _OBLIQUE:
             axes.set_axis_off()
@@ -72,6 +78,7 @@ def rig_pictures(calibration: Calibration, prefix: str) -> list[Picture]:
 def _draw_rig(
     axes: Axes,
     cameras: tuple[CameraCalibration, ...],
+    rims: list[np.ndarray],
     poses: list[np.ndarray],
     T_cam0_imu: np.ndarray | None,
     view: np.ndarray,
@@ -81,30 +88,49 @@ def _draw_rig(
     size = 0.22 * extent if extent > 1e-6 else 0.05
     flat = centres @ view.T
     axes.plot(*flat[: len(poses)].T, "-", color=MUTED, linewidth=0.8)
-    for camera, pose in zip(cameras, poses, strict=True):
-        for line in _frustum(camera, size):
+    for camera, rim, pose in zip(cameras, rims, poses, strict=True):
+        for line in _frustum(rim * size):
             axes.plot(*((line @ pose[:3, :3].T + pose[:3, 3]) @ view.T).T, color=ACCENT, linewidth=1.1)
-        at = pose[:3, 3] @ view.T
-        axes.annotate(camera.name, at, (0, -11), textcoords="offset points", ha="center", fontsize=8.5, color=INK)
+        _name(axes, camera.name, pose[:3, 3] @ view.T)
     if T_cam0_imu is not None:
         centre = T_cam0_imu[:3, 3]
         for axis, colour in enumerate(AXIS_COLOURS):
             line = np.stack([centre, centre + 0.8 * size * T_cam0_imu[:3, axis]])
             axes.plot(*(line @ view.T).T, color=colour, linewidth=1.8)
-        at = centre @ view.T
-        axes.annotate("imu0", at, (0, -11), textcoords="offset points", ha="center", fontsize=8.5, color=INK)
+        _name(axes, "imu0", centre @ view.T)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.12)
 
 
-def _frustum(camera: CameraCalibration, depth: float) -> list[np.ndarray]:
-    """Lines of a pyramid, camera frame: four edges and the far rim."""
+def _name(axes: Axes, text: str, at: np.ndarray) -> None:
+    axes.annotate(
+        text,
+        (float(at[0]), float(at[1])),
+        (0, -14),
+        textcoords="offset points",
+        ha="center",
+        fontsize=8.5,
+        color=INK,
+        bbox={"facecolor": PAPER, "edgecolor": "none", "alpha": 0.7, "pad": 1.0},
+    )
+
+
+def _rim_rays(camera: CameraCalibration) -> np.ndarray:
+    """Unit rays (4, 3) through the corners of the image, camera frame; zero where the model has none."""
     width, height = camera.image_size
-    corners = np.array([[0.0, 0.0], [width - 1.0, 0.0], [width - 1.0, height - 1.0], [0.0, height - 1.0]])
-    rays = np.asarray(camera.model.unproject(corners))
-    rays = np.where(np.isfinite(rays), rays, 0.0) * depth
-    edges = [np.stack([np.zeros(3), ray]) for ray in rays]
-    return [*edges, np.vstack([rays, rays[:1]])]
+    corners = jnp.array([[0.0, 0.0], [width - 1.0, 0.0], [width - 1.0, height - 1.0], [0.0, height - 1.0]])
+    rays = np.asarray(_unproject(camera.model, corners))
+    return np.where(np.isfinite(rays), rays, 0.0)
+
+
+@eqx.filter_jit
+def _unproject(model: CameraModel, pixels: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
+    return model.unproject(pixels)
+
+
+def _frustum(rim: np.ndarray) -> list[np.ndarray]:
+    """Lines of a pyramid with its tip at the origin: four edges to the points `rim` (4, 3), and the rim."""
+    return [*(np.stack([np.zeros(3), point]) for point in rim), np.vstack([rim, rim[:1]])]
 
 
 def _scale_bar(axes: Axes) -> None:

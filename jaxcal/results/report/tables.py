@@ -15,6 +15,7 @@ from jaxcal.results.parameters import (
     transform_estimates,
     vector_estimates,
 )
+from jaxcal.results.verdict import Check
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,28 @@ class CameraTables:
     poses: tuple[Table, ...]
 
 
+@dataclass(frozen=True)
+class CheckRow:
+    """One check over several subjects: what is wanted, and the outcome per subject (None where it does not apply)."""
+
+    title: str
+    wanted: str
+    checks: tuple[Check | None, ...]
+
+
+def check_rows(checks: tuple[Check, ...], subjects: tuple[str, ...]) -> tuple[CheckRow, ...]:
+    """The checks of the given subjects, one row per title, one column per subject."""
+    found = {(check.title, check.subject): check for check in checks if check.subject in subjects}
+    # The order of the fullest subject: a first camera has no check of its pose to the one before.
+    by_subject = sorted(subjects, key=lambda subject: -sum(other == subject for _, other in found))
+    rows = []
+    for title in dict.fromkeys(title for subject in by_subject for title, other in found if other == subject):
+        row = tuple(found.get((title, subject)) for subject in subjects)
+        wanted = dict.fromkeys(check.wanted for check in row if check is not None)
+        rows.append(CheckRow(title, " or ".join(wanted), row))
+    return tuple(rows)
+
+
 def camera_tables(calibration: Calibration, index: int) -> CameraTables:
     """The tables of camera `index`."""
     camera = calibration.cameras[index]
@@ -73,7 +96,7 @@ def gravity_table(calibration: Calibration) -> Table | None:
         return None
     rows = _rows(vector_estimates(calibration, calibration.gravity, "gravity", "g", "m/s²"))
     size = float(np.linalg.norm(calibration.gravity))
-    return Table("Gravity", rows, f"In the target's frame (x right, y up, z out of the board); size {size:.4f} m/s².")
+    return Table("In the target's frame", rows, f"x right, y up, z out of the board; size {size:.4f} m/s².")
 
 
 def imu_facts(calibration: Calibration) -> tuple[tuple[str, str], ...]:
