@@ -1,0 +1,76 @@
+"""From a fit to the `Calibration` that users get."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxcal.calibration import outliers, uncertainty
+from jaxcal.calibration.assemble import CameraFrames
+from jaxcal.calibration.checks import versions
+from jaxcal.calibration.robust import RobustFit
+from jaxcal.calibration.state import camera_model_of, transform
+from jaxcal.results import Calibration, CameraCalibration, ImuCalibration
+from jaxcal.targets import Target
+
+
+def chain_covariance_and_sentences(
+    fit: RobustFit, names: Sequence[str], num_intrinsics: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Covariance of shared parameters, marginal covariance of the chain, sentences on what is unobserved."""
+    labels = uncertainty.labels_of(names, fit.problem.layout, num_intrinsics)
+    return uncertainty.shared_covariance(fit.result.equations, np.asarray(fit.problem.free), labels)
+
+
+def calibration_from(
+    fit: RobustFit,
+    names: Sequence[str],
+    cameras: Sequence[CameraFrames],
+    usable: Sequence[np.ndarray],
+    target: Target,
+    *,
+    covariance: np.ndarray,
+    imu: ImuCalibration | None,
+    warnings: Sequence[str],
+    settings: Mapping[str, Any],
+) -> Calibration:
+    """Assemble the result; `covariance` (P, P) is that of the shared tangent vector."""
+    state, layout = fit.state, fit.problem.layout
+    models = [camera_model_of(state, layout, fit.problem.templates, c) for c in range(layout.num_cameras)]
+    num_intrinsics = [model.num_intrinsics for model in models]
+    blocks, named = uncertainty.named_covariance(names, layout, state, covariance, num_intrinsics, imu is not None)
+    T_cam_rig = [transform(np.asarray(R), np.asarray(t)) for R, t in zip(state.R_cam_rig, state.t_cam_rig, strict=True)]
+    seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]
+    results = []
+    for c, (name, frames) in enumerate(zip(names, cameras, strict=True)):
+        errors = np.where(seen[c][..., None], fit.errors[c], np.nan)
+        results.append(
+            CameraCalibration(
+                name=name,
+                model=models[c],
+                image_size=frames.detections.image_size,
+                T_cn_cnm1=None if c == 0 else T_cam_rig[c] @ np.linalg.inv(T_cam_rig[c - 1]),
+                T_cam_imu=None if imu is None else T_cam_rig[c],
+                timeshift_cam_imu=None if imu is None else float(state.shift[c]),
+                detections=frames.detections,
+                residuals_px=frames.per_corner(errors, np.nan),
+                inlier=frames.per_corner(fit.kept[c], False),
+                corner_sigma_px=fit.sigmas[c],
+            )
+        )
+    sentences = [*warnings, *outliers.rejection_warnings(names, seen, fit.kept)]
+    if not bool(fit.result.converged):
+        sentences.insert(0, "The optimisation stopped before it converged. Do not use this result.")
+    history = np.asarray(fit.result.history)
+    return Calibration(
+        cameras=tuple(results),
+        target=target,
+        gravity=None if imu is None else np.asarray(state.gravity),
+        imu=imu,
+        blocks=blocks,
+        covariance=named,
+        convergence=history[np.isfinite(history)],
+        warnings=tuple(sentences),
+        settings=dict(settings),
+        versions=versions(),
+    )

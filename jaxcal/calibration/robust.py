@@ -1,0 +1,119 @@
+"""Solving with unknown corner noise and outliers: robust loss first, then rejection, then plain least squares."""
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcal.calibration import outliers
+from jaxcal.calibration.assemble import CameraFrames, masked_weights, split_groups, stack_groups
+from jaxcal.calibration.problem import RigProblem
+from jaxcal.calibration.state import RigState
+from jaxcal.errors import CalibrationError
+from jaxcal.estimation import SolveResult, solve
+from jaxcal.progress import Progress
+
+logger = logging.getLogger(__name__)
+
+_HUBER_SIGMAS = 2.5
+ROUNDS = 4
+
+# Adapts a problem to the residuals found so far (re-weights its IMU, say).
+Reweigh = Callable[[RigProblem, RigState], RigProblem]
+
+
+@dataclass(frozen=True)
+class RobustFit:
+    """The optimum with what was learnt on the way: per camera errors (F, N, 2) px, inliers (F, N), corner noise px."""
+
+    problem: RigProblem
+    result: SolveResult
+    errors: list[np.ndarray]
+    kept: list[np.ndarray]
+    sigmas: list[float]
+
+    @property
+    def state(self) -> RigState:
+        return self.result.state
+
+
+@eqx.filter_jit
+def corner_errors(problem: RigProblem, state: RigState) -> tuple:
+    """Projection minus measurement, px, per group."""
+    return problem.corner_errors(state)
+
+
+def robust_fit(
+    problem: RigProblem,
+    state: RigState,
+    cameras: Sequence[CameraFrames],
+    usable: Sequence[np.ndarray],
+    *,
+    first_sigmas: Sequence[float],
+    pose_parameters: Sequence[float],
+    max_steps: int,
+    progress: Progress,
+    reweigh: Reweigh | None = None,
+) -> RobustFit:
+    """Solve, estimating the corner noise of each camera and leaving outliers out.
+
+    Rounds: Huber's loss with `first_sigmas`; Huber's loss with the noise found (median); plain least squares on the
+    inliers; the same with the noise of the inliers (root mean square). `usable[c]` (F,) are the frames that may take
+    part; `pose_parameters[c]` how many parameters of the trajectory a camera's corners pay for, for the degrees of
+    freedom.
+    """
+    layout = problem.layout
+    seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]
+    kept, sigmas = seen, list(first_sigmas)
+    result: SolveResult | None = None
+    errors: list[np.ndarray] = []
+    for stage in range(ROUNDS):
+        progress("optimise", stage, ROUNDS)
+        width = _HUBER_SIGMAS if stage < 2 else np.inf
+        problem = _with_weights(problem, cameras, kept, sigmas, width)
+        if reweigh is not None and result is not None:
+            problem = reweigh(problem, state)
+        result = solve(problem, state, max_steps=max_steps)
+        state = result.state
+        errors = split_groups(layout, cameras, [np.asarray(e) for e in corner_errors(problem, state)])
+        if not np.isfinite(float(result.equations.cost)):
+            raise CalibrationError(
+                "the optimisation diverged: the residuals are not finite. Check for frames with a wrong board, and "
+                "that the camera models suit the lenses."
+            )
+        if stage < 2:
+            sigmas = [outliers.robust_sigma(e, s) for e, s in zip(errors, kept, strict=True)]
+        if stage == 1:
+            kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(errors, seen, sigmas, strict=True)]
+        if stage >= 2:
+            parameters = [n + p for n, p in zip(layout.sizes, pose_parameters, strict=True)]
+            sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(errors, kept, parameters, strict=True)]
+        logger.info(
+            "round %d: cost %.6g after %d iterations, corner noise %s px",
+            stage,
+            float(result.equations.cost),
+            int(result.iterations),
+            ", ".join(f"{sigma:.3f}" for sigma in sigmas),
+        )
+    progress("optimise", ROUNDS, ROUNDS)
+    assert result is not None
+    return RobustFit(problem, result, errors, kept, sigmas)
+
+
+def _with_weights(
+    problem: RigProblem,
+    cameras: Sequence[CameraFrames],
+    kept: Sequence[np.ndarray],
+    sigmas: Sequence[float],
+    huber_width: float,
+) -> RigProblem:
+    weights = masked_weights(cameras, [k / sigma**2 for k, sigma in zip(kept, sigmas, strict=True)])
+    stacked = stack_groups(problem.layout, weights)
+    return eqx.tree_at(
+        lambda p: [*[data.weight for data in p.corners], p.huber_width],
+        problem,
+        [*stacked, jnp.asarray(float(huber_width))],
+    )

@@ -1,0 +1,110 @@
+"""Building and solving camera-only problems: used by the initialisation and by the final joint estimate."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcal.calibration.assemble import CameraFrames, round_up, vision_data
+from jaxcal.calibration.problem import LensPrior, RigProblem
+from jaxcal.calibration.state import RigState, SharedLayout, camera_model_of, layout_of
+from jaxcal.cameras import CameraModel
+from jaxcal.estimation import SolveResult, solve
+from jaxcal.targets import Target
+
+_VIEW_STEP = 8
+
+
+def no_prior(layout: SharedLayout) -> LensPrior:
+    """Lenses of which nothing is known beforehand."""
+    sizes = [(len(members), layout.sizes[members[0]]) for members in layout.groups]
+    return LensPrior(
+        mean=tuple(jnp.zeros(shape) for shape in sizes),
+        information=tuple(jnp.zeros((c, n, n)) for c, n in sizes),
+    )
+
+
+def templates_of(models: Sequence[CameraModel], layout: SharedLayout) -> tuple[CameraModel, ...]:
+    """One model per group, to be given parameters."""
+    return tuple(models[members[0]] for members in layout.groups)
+
+
+def stack_lenses(models: Sequence[CameraModel], layout: SharedLayout) -> tuple[jnp.ndarray, ...]:
+    """Lens parameters (C_g, n) of each group."""
+    return tuple(jnp.stack([models[c].parameters for c in members]) for members in layout.groups)
+
+
+def camera_problem(
+    models: Sequence[CameraModel],
+    cameras: Sequence[CameraFrames],
+    target: Target,
+    *,
+    views: Sequence[np.ndarray],
+    weights: Sequence[np.ndarray],
+    T_cam_rig: tuple[np.ndarray, np.ndarray],
+    T_target_rig: tuple[np.ndarray, np.ndarray],
+    huber_width: float,
+) -> tuple[RigProblem, RigState]:
+    """Problem and start of a camera-only calibration; cam0's pose in the rig, time shifts and gravity are held."""
+    layout = layout_of(list(models))
+    free = np.ones(layout.size, dtype=bool)
+    free[layout.pose(0)] = False
+    free[layout.gravity] = False
+    free[[layout.shift(c) for c in range(layout.num_cameras)]] = False
+
+    count = len(T_target_rig[0])
+    padding = round_up(count, _VIEW_STEP) - count
+    free_chain = np.zeros((count + padding, 6), dtype=bool)
+    for view, weight in zip(views, weights, strict=True):
+        free_chain[np.asarray(view)[np.asarray(weight).sum(axis=1) > 0]] = True
+    rotations = np.concatenate([T_target_rig[0], np.tile(np.eye(3), (padding, 1, 1))])
+    positions = np.concatenate([T_target_rig[1], np.zeros((padding, 3))])
+    problem = RigProblem(
+        templates=templates_of(models, layout),
+        corners=vision_data(layout, cameras, target, weights=weights, views=views),
+        imu=None,
+        prior=no_prior(layout),
+        free_chain=jnp.asarray(free_chain),
+        free=jnp.asarray(free),
+        huber_width=jnp.asarray(float(huber_width)),
+        layout=layout,
+        order=1,
+    )
+    state = RigState(
+        lenses=stack_lenses(models, layout),
+        R_cam_rig=jnp.asarray(T_cam_rig[0]),
+        t_cam_rig=jnp.asarray(T_cam_rig[1]),
+        shift=jnp.zeros(layout.num_cameras),
+        gravity=jnp.array([0.0, 0.0, -1.0]),
+        rotations=jnp.asarray(rotations),
+        positions=jnp.asarray(positions),
+        biases=jnp.zeros((len(positions), 0)),
+    )
+    return problem, state
+
+
+def refine_single(
+    model: CameraModel,
+    frames: CameraFrames,
+    target: Target,
+    R_cam_target: np.ndarray,
+    t_cam_target: np.ndarray,
+    *,
+    max_steps: int,
+    huber_width: float = 3.0,
+) -> tuple[CameraModel, float]:
+    """Optimise one camera and its board poses; the refined model and the cost (half the robust sum of squares, px^2)."""
+    R_target_cam = R_cam_target.swapaxes(-1, -2)
+    problem, state = camera_problem(
+        [model],
+        [frames],
+        target,
+        views=[np.arange(len(frames.frames))],
+        weights=[np.ones(frames.seen.shape)],
+        T_cam_rig=(np.eye(3)[None], np.zeros((1, 3))),
+        T_target_rig=(R_target_cam, -np.einsum("fij,fj->fi", R_target_cam, t_cam_target)),
+        huber_width=huber_width,
+    )
+    result: SolveResult = solve(problem, state, max_steps=max_steps)
+    refined = camera_model_of(result.state, problem.layout, problem.templates, 0)
+    return refined, float(result.equations.cost)

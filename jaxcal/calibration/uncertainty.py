@@ -1,0 +1,101 @@
+"""Covariance of the calibration from the Schur complement, and words for what it does not determine."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcal.calibration.state import RigState, SharedLayout, tangent_basis
+from jaxcal.estimation import BlockArrow, factorise
+
+# Eigenvalues of the information matrix, scaled to unit diagonal, below which a direction counts as unobserved.
+_UNOBSERVED = 1e-11
+
+
+@eqx.filter_jit
+def _schur(equations: BlockArrow) -> tuple:
+    chain, shared = equations.diagonal()
+    # Keeps chain blocks that nothing observes (knots in a gap) from spoiling the factor; far below any information.
+    factor = factorise(equations, 1e-13 * jnp.maximum(chain, 1e-6 * jnp.max(chain)), jnp.zeros_like(shared))
+    return factor.schur, factor.chain_covariance()
+
+
+def shared_covariance(
+    equations: BlockArrow, free: np.ndarray, labels: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Covariance (P, P) of the shared parameters (zero where held), marginal covariance (K, B, B) of the chain blocks,
+    and sentences about directions that the data leave open."""
+    schur, chain = (np.asarray(part) for part in _schur(equations))
+    information = schur[np.ix_(free, free)]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])
+    weak = values < _UNOBSERVED
+    sentences = [_unobserved_sentence(vectors[:, k], np.asarray(labels)[free]) for k in np.flatnonzero(weak)]
+    inverse = (vectors / np.maximum(values, _UNOBSERVED)) @ vectors.T
+    covariance = np.zeros(schur.shape)
+    covariance[np.ix_(free, free)] = inverse * scale[:, None] * scale[None, :]
+    return covariance, chain, sentences
+
+
+def _unobserved_sentence(direction: np.ndarray, labels: np.ndarray) -> str:
+    strongest = np.argsort(-np.abs(direction))[:4]
+    named = ", ".join(labels[k] for k in strongest if abs(direction[k]) > 0.2)
+    return (
+        f"The recording does not determine a combination of: {named}. Do not use these values; record with more varied "
+        "tilt, distance and place in the image (with an IMU: rotate about two axes at least)."
+    )
+
+
+def labels_of(names: Sequence[str], layout: SharedLayout, num_intrinsics: Sequence[int]) -> list[str]:
+    """A name for every coordinate of the shared tangent vector."""
+    labels: list[str] = []
+    for c, name in enumerate(names):
+        size = layout.sizes[c]
+        known = ["fx", "fy", "cx", "cy"] if num_intrinsics[c] == 4 else [f"p{i}" for i in range(num_intrinsics[c])]
+        lens = known + [f"distortion[{i}]" for i in range(size - num_intrinsics[c])]
+        pose = [f"rotation {a}" for a in "xyz"] + [f"translation {a}" for a in "xyz"]
+        labels += [f"{name} {label}" for label in [*lens, *pose, "time shift"]]
+    return [*labels, "gravity direction 1", "gravity direction 2"]
+
+
+def _hat(v: np.ndarray) -> np.ndarray:
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+def named_covariance(
+    names: Sequence[str],
+    layout: SharedLayout,
+    state: RigState,
+    covariance: np.ndarray,
+    num_intrinsics: Sequence[int],
+    with_imu: bool,
+) -> tuple[tuple[tuple[str, int], ...], np.ndarray]:
+    """Blocks and joint covariance of the parameters as `Calibration` names them, by linear propagation."""
+    blocks: list[tuple[str, int]] = []
+    rows: list[np.ndarray] = []
+    identity = np.eye(layout.size)
+    R, t = np.asarray(state.R_cam_rig), np.asarray(state.t_cam_rig)
+    for c, name in enumerate(names):
+        lens = identity[layout.lens(c)]
+        blocks.append((f"{name}.intrinsics", num_intrinsics[c]))
+        rows.append(lens[: num_intrinsics[c]])
+        if layout.sizes[c] > num_intrinsics[c]:
+            blocks.append((f"{name}.distortion", layout.sizes[c] - num_intrinsics[c]))
+            rows.append(lens[num_intrinsics[c] :])
+        if c > 0:
+            blocks.append((f"{name}.T_cn_cnm1", 6))
+            own, before = identity[layout.pose(c)], identity[layout.pose(c - 1)]
+            R_rel = R[c] @ R[c - 1].T
+            turn = own[:3] - R_rel @ before[:3]
+            rows.append(np.concatenate([turn, own[3:] + _hat(R_rel @ t[c - 1]) @ turn - R_rel @ before[3:]]))
+        if with_imu:
+            blocks.append((f"{name}.T_cam_imu", 6))
+            rows.append(identity[layout.pose(c)])
+            blocks.append((f"{name}.timeshift_cam_imu", 1))
+            rows.append(identity[[layout.shift(c)]])
+    if with_imu:
+        blocks.append(("gravity", 3))
+        rows.append(np.asarray(tangent_basis(state.gravity)) @ identity[layout.gravity])
+    jacobian = np.concatenate(rows)
+    return tuple(blocks), jacobian @ covariance @ jacobian.T

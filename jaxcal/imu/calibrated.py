@@ -1,0 +1,48 @@
+"""Kalibr's IMU model `calibrated`: a gyroscope and an accelerometer with slowly varying biases, at one point."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxcal.trajectory import RotationPoint, so3
+
+
+def predict(
+    rotation: Float[Array, "3 3"],
+    angular_velocity: Float[Array, "3"],
+    acceleration: Float[Array, "3"],
+    gravity: Float[Array, "3"],
+    bias: Float[Array, "6"],
+) -> Float[Array, "6"]:
+    """Gyroscope (rad/s) and accelerometer (m/s^2) readings, stacked, of an IMU with pose R = R_target_imu.
+
+    gyro = omega + b_g, accel = R' (a - g) + b_a: `angular_velocity` in the IMU's frame, `acceleration` and `gravity`
+    (free fall, pointing down) in the target's frame, `bias` = (b_g, b_a). Furgale et al. 2013, eq. 11 and 12.
+    """
+    return jnp.concatenate([angular_velocity, rotation.T @ (acceleration - gravity)]) + bias
+
+
+def predict_with_jacobian(
+    point: RotationPoint,
+    acceleration: Float[Array, "3"],
+    acceleration_weights: Float[Array, " k"],
+    gravity: Float[Array, "3"],
+    gravity_basis: Float[Array, "3 2"],
+    bias: Float[Array, "6"],
+    bias_weights: Float[Array, " k"],
+) -> tuple[Float[Array, "6"], Float[Array, "6 k 12"], Float[Array, "6 2"]]:
+    """Readings as `predict`, and their Jacobians by the window of k control points and by the direction of gravity.
+
+    Each control point has 12 tangent coordinates: rotation (right perturbation), position, gyro bias, accel bias.
+    `acceleration_weights` are the second derivatives of the position basis; `bias_weights` those of the biases' basis.
+    """
+    order = acceleration_weights.shape[0]
+    readings = predict(point.rotation, point.velocity, acceleration, gravity, bias)
+    force = readings[3:] - bias[3:]
+    zero = jnp.zeros((3, order, 3))
+    by_rotation = jnp.concatenate(
+        [point.velocity_jacobian, jnp.einsum("ij,jkl->ikl", so3.hat(force), point.rotation_jacobian)]
+    )
+    by_position = jnp.concatenate([zero, point.rotation.T[:, None, :] * acceleration_weights[None, :, None]])
+    by_bias = jnp.eye(6)[:, None, :] * bias_weights[None, :, None]
+    by_gravity = jnp.concatenate([jnp.zeros((3, 2)), -point.rotation.T @ gravity_basis])
+    return readings, jnp.concatenate([by_rotation, by_position, by_bias], axis=2), by_gravity
