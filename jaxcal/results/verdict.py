@@ -18,7 +18,7 @@ _RMS_OVER_NOISE = (1.5, 4.0)  # 1 when the residuals are Gaussian
 _FOCAL_SIGMA = (0.005, 0.03)  # relative
 _COVERAGE = (0.5, 0.15)
 _INLIERS = (0.9, 0.5)
-_FRAMES = (10, 3)
+_FRAMES = (10.0, 3.0)
 _ROTATION_SIGMA_DEG = (0.2, 2.0)
 _TRANSLATION_SIGMA_M = (0.01, 0.1)
 _TIMESHIFT_SIGMA_MS = (1.0, 10.0)
@@ -162,8 +162,8 @@ def _view_checks(camera: CameraCalibration) -> Iterator[Check]:
         camera.name,
         "frames used",
         f"{frames}",
-        f"at least {_FRAMES[0]}",
-        _below(frames, _FRAMES),
+        f"at least {_FRAMES[0]:g}",
+        _below(float(frames), _FRAMES),
         f"{camera.name} has only {frames} frames with the target",
         "Record longer, with the whole target in view.",
     )

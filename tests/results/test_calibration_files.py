@@ -150,7 +150,7 @@ def test_a_truncated_file_is_refused(tmp_path_factory: pytest.TempPathFactory, k
     content = _saved_bytes(tmp_path_factory)
     file = tmp_path_factory.mktemp("cut") / "calibration.npz"
     file.write_bytes(content[: int(len(content) * keep)])
-    with pytest.raises(CalibrationError, match="copy it again|calibrate and save again"):
+    with pytest.raises(CalibrationError, match=r"copy it again|calibrate and save again"):
         load_calibration(file)
 
 

@@ -52,6 +52,11 @@ def frame_rms(camera: CameraCalibration) -> tuple[np.ndarray, np.ndarray]:
     return frames, np.sqrt(np.bincount(place, weights=squares, minlength=len(frames)) / np.maximum(counts, 1))
 
 
+def _corner_sigma(camera: CameraCalibration) -> float:
+    """The corner noise, px; 0 where there were too few corners to estimate it."""
+    return camera.corner_sigma_px if np.isfinite(camera.corner_sigma_px) else 0.0
+
+
 def _coverage_picture(camera: CameraCalibration, prefix: str) -> Picture:
     figure, axes = image_panel(camera.image_size)
     counts = corner_counts(camera)
@@ -74,7 +79,7 @@ def _coverage_picture(camera: CameraCalibration, prefix: str) -> Picture:
 
 def _scatter_picture(camera: CameraCalibration, prefix: str) -> Picture:
     figure, (axes,) = panel()
-    sigma = camera.corner_sigma_px
+    sigma = _corner_sigma(camera)
     used, rejected = camera.residuals_px[camera.used], _rejected(camera)
     limit = 5.0 * sigma if sigma > 0 else 1.0
     faint = float(np.clip(4000.0 / max(len(used), 1), 0.08, 0.5))  # so that a dense cloud still shows its core
@@ -106,11 +111,11 @@ def _scatter_picture(camera: CameraCalibration, prefix: str) -> Picture:
 def _histogram_picture(camera: CameraCalibration, prefix: str) -> Picture:
     figure, (axes,) = panel()
     used = camera.residuals_px[camera.used]
-    if len(used) and camera.corner_sigma_px > 0:
+    if len(used) and _corner_sigma(camera) > 0:
         edges = np.linspace(-5.0, 5.0, 51)
         centres = (edges[1:] + edges[:-1]) / 2.0
         for axis, (name, colour) in enumerate((("u", X), ("v", Y))):
-            density = np.histogram(used[:, axis] / camera.corner_sigma_px, edges)[0] / (len(used) * 0.2)
+            density = np.histogram(used[:, axis] / _corner_sigma(camera), edges)[0] / (len(used) * 0.2)
             axes.step(centres, density, where="mid", color=colour, linewidth=1.2, label=name)
         axes.plot(centres, norm.pdf(centres), "--", color=INK, linewidth=1.0, label="N(0, 1)")
         legend(axes, loc="upper right")
@@ -141,9 +146,9 @@ def _field_picture(camera: CameraCalibration, prefix: str) -> Picture:
         / np.maximum(counts, 1)[:, None]
     )
     shown = counts >= _FEWEST_FOR_MEAN
-    if shown.any() and camera.corner_sigma_px > 0:
+    if shown.any() and _corner_sigma(camera) > 0:
         # One corner sigma is drawn as long as a cell is wide: systematic errors are read against the noise.
-        arrows = means[shown] / camera.corner_sigma_px * (width / across)
+        arrows = means[shown] / _corner_sigma(camera) * (width / across)
         x = (np.arange(across * down)[shown] % across + 0.5) * width / across - 0.5
         y = (np.arange(across * down)[shown] // across + 0.5) * height / down - 0.5
         axes.quiver(
@@ -155,7 +160,7 @@ def _field_picture(camera: CameraCalibration, prefix: str) -> Picture:
     return Picture(
         "Mean residual over the image",
         to_svg(figure, prefix),
-        f"Mean residual per cell; one corner sigma ({camera.corner_sigma_px:.3f} px) is drawn one cell long. "
+        f"Mean residual per cell; one corner sigma ({_corner_sigma(camera):.3f} px) is drawn one cell long. "
         f"The largest mean is {largest:.3f} px.",
         "short arrows without order.",
         "a pattern (a vortex, a ring, a shear) is error the lens model cannot express, or a board that is not flat.",
@@ -177,7 +182,7 @@ def _radial_picture(camera: CameraCalibration, prefix: str) -> Picture:
     spread = np.bincount(place, weights=outward**2, minlength=_RADIUS_BINS) / np.maximum(counts, 1) - mean**2
     error = np.sqrt(np.maximum(spread, 0.0) / np.maximum(counts, 1))
     centre = (np.arange(_RADIUS_BINS) + 0.5) / _RADIUS_BINS * edge
-    sigma = camera.corner_sigma_px
+    sigma = _corner_sigma(camera)
     axes.axhspan(-sigma, sigma, color=MUTED, alpha=0.15, linewidth=0.0)
     axes.axhline(0.0, color=MUTED, linewidth=0.8)
     if shown.any():
@@ -203,7 +208,7 @@ def _frames_picture(camera: CameraCalibration, prefix: str) -> Picture:
     figure, (axes,) = panel()
     frames, rms = frame_rms(camera)
     times = camera.detections.timestamps_ns
-    expected = np.sqrt(2.0) * camera.corner_sigma_px
+    expected = np.sqrt(2.0) * _corner_sigma(camera)
     if len(frames):
         seconds = (times[frames] - times[0]) * 1e-9
         axes.plot(seconds, rms, "-", color=ACCENT, linewidth=0.7, alpha=0.5)

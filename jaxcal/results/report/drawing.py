@@ -2,6 +2,7 @@
 
 import io
 import re
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -30,6 +31,7 @@ REJECTED = "#e2574c"
 
 PANEL = (4.4, 3.3)  # inches; three abreast on a desk, one on a phone
 _FONT_SIZE = 9.0
+_SETTINGS_LOCK = threading.Lock()  # matplotlib's SVG writer reads process-wide settings
 _RASTER_DPI = 180
 
 
@@ -116,7 +118,7 @@ def to_svg(figure: Figure, prefix: str) -> str:
     """The figure as an `<svg>` element that scales with the page; `prefix` keeps its ids apart from other figures'."""
     buffer = io.StringIO()
     # Text stays text (smaller, selectable); the salt makes ids, and so the page, the same in every run.
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "jaxcal"}):
+    with _SETTINGS_LOCK, mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "jaxcal"}):
         figure.savefig(buffer, format="svg", transparent=True, dpi=_RASTER_DPI)
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :]
@@ -139,6 +141,6 @@ def _dress(axes: Axes) -> None:
         spine.set_color(LINE)
         spine.set_linewidth(0.8)
         spine.set_visible(side in ("left", "bottom"))
-    axes.tick_params(colors=MUTED, labelcolor=MUTED, labelsize=_FONT_SIZE - 1.0, length=3.0, width=0.8)
+    axes.tick_params(which="both", colors=MUTED, labelcolor=MUTED, labelsize=_FONT_SIZE - 1.0, length=3.0, width=0.8)
     axes.grid(visible=True, color=LINE, linewidth=0.6, alpha=0.6)
     axes.set_axisbelow(True)
