@@ -1,0 +1,390 @@
+"""`calibrate_camera_imu`: cameras and an IMU jointly, on a continuous-time trajectory."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcal.calibration import inertial, initial_imu, solving, spline_setup
+from jaxcal.calibration.assemble import CameraFrames, camera_frames, vision_data
+from jaxcal.calibration.checks import resolve_models, resolve_names
+from jaxcal.calibration.inertial import InertialData
+from jaxcal.calibration.initial_imu import Alignment, CameraTrack
+from jaxcal.calibration.initial_lens import board_poses, initial_lens
+from jaxcal.calibration.outcome import calibration_from, chain_covariance_and_sentences
+from jaxcal.calibration.problem import LensPrior, RigProblem
+from jaxcal.calibration.robust import RobustFit, robust_fit
+from jaxcal.calibration.spline_setup import SplineGrid
+from jaxcal.calibration.state import RigState, SharedLayout, layout_of
+from jaxcal.cameras import CameraModel, model_name
+from jaxcal.errors import CalibrationError
+from jaxcal.observations import Detections, ImuRecording
+from jaxcal.progress import Progress, no_progress, track
+from jaxcal.results import Calibration, ImuCalibration
+from jaxcal.targets import Target
+
+# The spline reaches this far beyond the first and last frame, so that time offsets have room to move (s).
+_MARGIN_S = 0.1
+# Frames nearer than this to the spline's ends are left out (s).
+_EDGE_S = 0.01
+# Tracks thin frames out to this spacing (s) when those of several cameras are merged.
+_TRACK_STEP_S = 0.004
+
+
+def calibrate_camera_imu(
+    detections: Sequence[Detections],
+    imu: ImuRecording,
+    target: Target,
+    models: Sequence[str | type[CameraModel]] | None = None,
+    *,
+    cameras: Calibration | None = None,
+    names: Sequence[str] | None = None,
+    intrinsics: Literal["free", "prior", "held"] = "free",
+    imu_noise: Literal["at least given", "given"] = "at least given",
+    spline_order: int = 6,
+    knot_rate_hz: float | None = None,
+    max_steps: int = 60,
+    progress: Progress = no_progress,
+) -> Calibration:
+    """Calibrate cameras and an IMU jointly: lenses, T_cam_imu, time offsets, gravity, biases and trajectory.
+
+    No initial guess is needed, and cameras need not be synchronised or see the board together. Model: Furgale, Rehder
+    and Siegwart, "Unified temporal and spatial calibration for multi-sensor systems", IROS 2013.
+
+    `detections` one per camera, `models` as for `calibrate_cameras`; `cameras` an earlier calibration of the same
+    cameras to start from. `intrinsics`: estimate the lenses freely, under the prior of `cameras`, or hold them.
+    `imu_noise`: 'given' trusts the noise densities; 'at least given' raises them where the residuals are larger, so
+    that sigmas stay honest. `spline_order` 4 to 6 and `knot_rate_hz`, chosen from the IMU's own spectrum by default.
+
+    Raises CalibrationError when frames and IMU do not overlap or do not move together, and as `calibrate_cameras`.
+    """
+    if spline_order not in (4, 5, 6):
+        raise CalibrationError(f"spline_order is {spline_order}; expected 4, 5 or 6.")
+    if intrinsics != "free" and cameras is None:
+        raise CalibrationError(f"intrinsics='{intrinsics}' needs `cameras`, the calibration that they come from.")
+    names = resolve_names(detections, names)
+    frames = [camera_frames(d, target, name) for d, name in zip(detections, names, strict=True)]
+    lenses = _first_lenses(names, detections, models, cameras, frames, target, progress)
+
+    imu_time = (imu.timestamps_ns - imu.timestamps_ns[0]) * 1e-9
+    start = _align_all(names, lenses, frames, target, imu, imu_time)
+    grid = _grid(start, imu_time, imu, spline_order, knot_rate_hz)
+    usable = [
+        (t + a.shift_s > grid.start + _EDGE_S) & (t + a.shift_s < grid.stop - _EDGE_S)
+        for t, a in zip(start.times, start.alignments, strict=True)
+    ]
+    for name, ok in zip(names, usable, strict=True):
+        if ok.sum() < 3:
+            raise CalibrationError(f"{name}: {ok.sum()} frames lie within the IMU recording; at least 3 are needed.")
+    data, slots, samples = spline_setup.bin_imu(
+        grid, imu_time, imu.gyro_rad_s, imu.accel_m_s2, imu.noise, imu.rate_hz
+    )
+    problem = _problem(lenses, frames, target, start, data, grid, cameras, names, intrinsics)
+    state = _first_state(lenses, problem.layout, start, grid, imu, imu_time)
+
+    fit = robust_fit(
+        problem,
+        state,
+        frames,
+        usable,
+        first_sigmas=start.sigmas,
+        pose_parameters=[0.0] * len(names),
+        max_steps=max_steps,
+        progress=progress,
+        reweigh=_reweigh_imu(data, grid) if imu_noise == "at least given" else None,
+    )
+    num_intrinsics = [lens.num_intrinsics for lens in lenses]
+    covariance, chain, sentences = chain_covariance_and_sentences(fit, names, num_intrinsics)
+    result = _imu_calibration(fit, imu, imu_time, data, slots, samples, chain, grid)
+    settings = {
+        "job": "calibrate_camera_imu",
+        "models": [model_name(lens) for lens in lenses],
+        "intrinsics": intrinsics,
+        "imu_noise": imu_noise,
+        "spline_order": spline_order,
+        "knot_rate_hz": 1.0 / grid.dt,
+        "max_steps": max_steps,
+    }
+    return calibration_from(
+        fit,
+        names,
+        frames,
+        usable,
+        target,
+        covariance=covariance,
+        imu=result,
+        warnings=[*sentences, *_imu_warnings(fit, data)],
+        settings=settings,
+    )
+
+
+@dataclass(frozen=True)
+class _Start:
+    """What is known before the joint solve, per camera; times on the camera's clock, s since the IMU's first sample."""
+
+    times: list[np.ndarray]
+    tracks: list[CameraTrack]
+    alignments: list[Alignment]
+    t_cam_imu: list[np.ndarray]
+    sigmas: list[float]
+    reference: int
+
+
+def _first_lenses(
+    names: Sequence[str],
+    detections: Sequence[Detections],
+    models: Sequence[str | type[CameraModel]] | None,
+    cameras: Calibration | None,
+    frames: Sequence[CameraFrames],
+    target: Target,
+    progress: Progress,
+) -> list[CameraModel]:
+    if cameras is not None:
+        if len(cameras.cameras) != len(detections):
+            raise CalibrationError(
+                f"`cameras` holds {len(cameras.cameras)} cameras, but there are detections of {len(detections)}."
+            )
+        return [camera.model for camera in cameras.cameras]
+    work = list(zip(names, resolve_models(detections, models), frames, strict=True))
+    return [initial_lens(n, m, f, target) for n, m, f in track(work, "initial lenses", len(work), progress)]
+
+
+def _align_all(
+    names: Sequence[str],
+    lenses: Sequence[CameraModel],
+    frames: Sequence[CameraFrames],
+    target: Target,
+    imu: ImuRecording,
+    imu_time: np.ndarray,
+) -> _Start:
+    """Board poses of each camera, their alignment with the IMU, and the cameras' places relative to each other."""
+    times, tracks, alignments, sigmas = [], [], [], []
+    for name, lens, camera in zip(names, lenses, frames, strict=True):
+        time = (camera.time_ns - imu.timestamps_ns[0]) * 1e-9
+        R_cam_target, t_cam_target, error = board_poses(lens, camera, target)
+        good = error <= max(4.0 * float(np.median(error)), 0.2)
+        R_target_cam = R_cam_target[good].swapaxes(-1, -2)
+        position = -np.einsum("fij,fj->fi", R_target_cam, t_cam_target[good])
+        times.append(time)
+        tracks.append(CameraTrack(time[good], R_target_cam, position))
+        alignments.append(initial_imu.align(tracks[-1], imu_time, imu.gyro_rad_s, name))
+        sigmas.append(max(float(np.median(error)) / np.sqrt(2.0), 1e-3))
+    shifts = [a.shift_s for a in alignments]
+    initial_imu.check_coverage(tracks, shifts, imu, imu_time)
+    reference = int(np.argmax([len(t.time_s) for t in tracks]))
+    arms = initial_imu.lever_arms(tracks[reference], tracks, shifts, shifts[reference])
+    arms[reference] = np.zeros(3)
+    return _Start(times, tracks, alignments, arms, sigmas, reference)
+
+
+def _grid(
+    start: _Start, imu_time: np.ndarray, imu: ImuRecording, order: int, knot_rate_hz: float | None
+) -> SplineGrid:
+    first = min(t.time_s[0] + a.shift_s for t, a in zip(start.tracks, start.alignments, strict=True)) - _MARGIN_S
+    last = max(t.time_s[-1] + a.shift_s for t, a in zip(start.tracks, start.alignments, strict=True)) + _MARGIN_S
+    first, last = max(first, imu_time[0]), min(last, imu_time[-1])
+    if knot_rate_hz is None:
+        inside = (imu_time >= first) & (imu_time <= last)
+        knot_rate_hz = spline_setup.choose_knot_rate(
+            imu_time[inside], imu.gyro_rad_s[inside], imu.accel_m_s2[inside], order
+        )
+    return spline_setup.make_grid(first, last, order, knot_rate_hz)
+
+
+def _problem(
+    lenses: Sequence[CameraModel],
+    frames: Sequence[CameraFrames],
+    target: Target,
+    start: _Start,
+    data: InertialData,
+    grid: SplineGrid,
+    cameras: Calibration | None,
+    names: Sequence[str],
+    intrinsics: str,
+) -> RigProblem:
+    layout = layout_of(list(lenses))
+    free = np.ones(layout.size, dtype=bool)
+    if intrinsics == "held":
+        for c in range(layout.num_cameras):
+            free[layout.lens(c)] = False
+    prior = solving.no_prior(layout)
+    if intrinsics == "prior" and cameras is not None:
+        prior = _lens_prior(cameras, layout)
+    return RigProblem(
+        templates=solving.templates_of(lenses, layout),
+        corners=vision_data(
+            layout, frames, target, weights=[np.ones(f.seen.shape) for f in frames], times=start.times
+        ),
+        imu=data,
+        prior=prior,
+        free_chain=jnp.ones((grid.intervals + grid.order - 1, 12), dtype=bool),
+        free=jnp.asarray(free),
+        huber_width=jnp.asarray(1.0),
+        layout=layout,
+        order=grid.order,
+    )
+
+
+def _lens_prior(cameras: Calibration, layout: SharedLayout) -> LensPrior:
+    """The camera-only calibration's lenses and the inverse of their covariance."""
+
+    def information(c: int) -> np.ndarray:
+        camera = cameras.cameras[c]
+        blocks = [f"{camera.name}.intrinsics"] + ([f"{camera.name}.distortion"] if len(camera.model.distortion) else [])
+        return np.linalg.inv(cameras.covariance_of(*blocks))
+
+    return LensPrior(
+        mean=tuple(jnp.stack([cameras.cameras[c].model.parameters for c in members]) for members in layout.groups),
+        information=tuple(jnp.stack([jnp.asarray(information(c)) for c in members]) for members in layout.groups),
+    )
+
+
+def _first_state(
+    lenses: Sequence[CameraModel],
+    layout: SharedLayout,
+    start: _Start,
+    grid: SplineGrid,
+    imu: ImuRecording,
+    imu_time: np.ndarray,
+) -> RigState:
+    time, rotation, position = _merged_track(start)
+    bias = start.alignments[start.reference].gyro_bias
+    inside = (imu_time >= grid.start) & (imu_time <= grid.stop)
+    imu_time = imu_time[inside]
+    orientation = initial_imu.orientation_track(time, rotation, imu_time, imu.gyro_rad_s[inside] - bias)
+    rotations, positions, biases = spline_setup.first_chain(grid, imu_time, orientation, time, position, bias)
+    return RigState(
+        lenses=solving.stack_lenses(lenses, layout),
+        R_cam_rig=jnp.asarray(np.stack([a.R_cam_imu for a in start.alignments])),
+        t_cam_rig=jnp.asarray(np.stack(start.t_cam_imu)),
+        shift=jnp.asarray([a.shift_s for a in start.alignments]),
+        gravity=jnp.asarray(initial_imu.gravity_from(orientation, imu.accel_m_s2[inside])),
+        rotations=jnp.asarray(rotations),
+        positions=jnp.asarray(positions),
+        biases=jnp.asarray(biases),
+    )
+
+
+def _merged_track(start: _Start) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """T_target_imu from the frames of all cameras: times on the IMU's clock, increasing and spaced; R; p."""
+    times, rotations, positions = [], [], []
+    for c, (camera, a) in enumerate(zip(start.tracks, start.alignments, strict=True)):
+        times.append(camera.time_s + a.shift_s)
+        rotations.append(camera.rotation @ a.R_cam_imu)
+        positions.append(camera.position + camera.rotation @ start.t_cam_imu[c])
+    time = np.concatenate(times)
+    # The reference camera comes first among frames of one instant.
+    rank = np.concatenate([np.full(len(t), int(c != start.reference)) for c, t in enumerate(times)])
+    order = np.lexsort((rank, np.round(time / _TRACK_STEP_S)))
+    keep = []
+    for k in order:
+        if not keep or time[k] - time[keep[-1]] > _TRACK_STEP_S / 2:
+            keep.append(k)
+    return time[keep], np.concatenate(rotations)[keep], np.concatenate(positions)[keep]
+
+
+@eqx.filter_jit
+def _whitened_imu(problem: RigProblem, state: RigState) -> jnp.ndarray:
+    assert problem.imu is not None
+    return inertial.imu_residuals(state, problem.imu, problem.order)
+
+
+def _noise_ratio(problem: RigProblem, state: RigState, data: InertialData, grid: SplineGrid) -> np.ndarray:
+    """How much larger than `data` says the noise of gyro and accel is (2,), degrees of freedom of the spline accounted."""
+    assert problem.imu is not None
+    scale = np.asarray(data.inverse_sigma / problem.imu.inverse_sigma)
+    residuals = np.asarray(_whitened_imu(problem, state)) * scale
+    count = float(np.sum(data.present))
+    freedom = max(1.0 - (grid.used + grid.order - 1) / count, 0.1)
+    mean_square = np.sum(residuals**2, axis=(0, 1)) / (count * freedom)
+    return np.sqrt(mean_square.reshape(2, 3).mean(axis=1))
+
+
+def _reweigh_imu(data: InertialData, grid: SplineGrid):
+    """Raise the IMU's noise to what the residuals show, never below what was given."""
+
+    def reweigh(problem: RigProblem, state: RigState) -> RigProblem:
+        ratio = np.maximum(_noise_ratio(problem, state, data, grid), 1.0)
+        inverse_sigma = data.inverse_sigma / jnp.asarray(np.repeat(ratio, 3))
+        return eqx.tree_at(lambda p: p.imu.inverse_sigma, problem, inverse_sigma)
+
+    return reweigh
+
+
+def _imu_warnings(fit: RobustFit, data: InertialData) -> list[str]:
+    assert fit.problem.imu is not None
+    ratio = np.asarray(data.inverse_sigma / fit.problem.imu.inverse_sigma)[[0, 3]]
+    return [
+        f"The {sensor}'s readings scatter {factor:.1f} times more about the trajectory than imu.yaml's "
+        f"{sensor}_noise_density says; the larger noise was used. Vibration, a loose mount or a datasheet value do this."
+        for sensor, factor in zip(("gyroscope", "accelerometer"), ratio, strict=True)
+        if factor > 2.0
+    ]
+
+
+@eqx.filter_jit
+def _predicted(problem: RigProblem, state: RigState) -> tuple:
+    from jaxcal.trajectory import PoseSpline
+
+    data = problem.imu
+    assert data is not None
+    times = data.start + (jnp.arange(data.fraction.shape[0])[:, None] + data.fraction) * data.dt
+    spline = PoseSpline(state.rotations, state.positions, data.start, data.dt, problem.order)
+    rotation, position, *_ = spline.evaluate(times.ravel())
+    shape = data.fraction.shape
+    return (
+        inertial.predict_samples(state, data, problem.order),
+        rotation.reshape(*shape, 3, 3),
+        position.reshape(*shape, 3),
+    )
+
+
+def _imu_calibration(
+    fit: RobustFit,
+    imu: ImuRecording,
+    imu_time: np.ndarray,
+    data: InertialData,
+    slots: np.ndarray,
+    samples: np.ndarray,
+    chain_covariance: np.ndarray,
+    grid: SplineGrid,
+) -> ImuCalibration:
+    assert fit.problem.imu is not None
+    at = (slots[:, 0], slots[:, 1])
+    readings, rotation, position = (np.asarray(part)[at] for part in _predicted(fit.problem, fit.state))
+    biases = np.asarray(fit.state.biases)
+    u = np.asarray(data.fraction)[at][:, None]
+    left = slots[:, 0]
+    bias = (1.0 - u) * biases[left] + u * biases[left + 1]
+    knot_std = np.sqrt(np.maximum(np.diagonal(chain_covariance[:, 6:, 6:], axis1=1, axis2=2), 0.0))
+    bias_std = (1.0 - u) * knot_std[left] + u * knot_std[left + 1]
+    sigma = 1.0 / np.asarray(fit.problem.imu.inverse_sigma)
+    noise = imu.noise
+    return ImuCalibration(
+        origin_ns=int(imu.timestamps_ns[0]),
+        t_s=imu_time[samples],
+        gyro_rad_s=imu.gyro_rad_s[samples],
+        accel_m_s2=imu.accel_m_s2[samples],
+        gyro_predicted=readings[:, :3],
+        accel_predicted=readings[:, 3:],
+        gyro_bias=bias[:, :3],
+        accel_bias=bias[:, 3:],
+        gyro_sigma=float(sigma[0]),
+        accel_sigma=float(sigma[3]),
+        position_m=position,
+        rotation=rotation,
+        noise={
+            "gyroscope_noise_density": noise.gyro_noise_density,
+            "gyroscope_random_walk": noise.gyro_random_walk,
+            "accelerometer_noise_density": noise.accel_noise_density,
+            "accelerometer_random_walk": noise.accel_random_walk,
+            "update_rate": imu.rate_hz,
+        },
+        knot_rate_hz=1.0 / grid.dt,
+        spline_order=grid.order,
+        gyro_bias_std=bias_std[:, :3],
+        accel_bias_std=bias_std[:, 3:],
+    )

@@ -1,0 +1,214 @@
+"""Time offset, rotation to the IMU and gyro bias from turning alone; gravity and first spline from the board's poses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from jaxcal.errors import CalibrationError
+from jaxcal.observations import ImuRecording
+
+STANDARD_GRAVITY = 9.80665
+# Frames further apart than this do not give a rate of turn.
+_LONGEST_STEP_S = 0.2
+_COARSE_STEP_S = 0.01
+_FINE_STEP_S = 0.001
+_LARGEST_SHIFT_S = 5.0
+_TRIM = 0.8
+_LEAST_CORRELATION = 0.4
+_LEAST_TURNING = 0.05
+
+
+@dataclass(frozen=True)
+class CameraTrack:
+    """Board poses of one camera over time: `time_s` (F,) camera clock, T_target_cam as `rotation` and `position`."""
+
+    time_s: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Camera against IMU: `shift_s` (t_imu = t_cam + shift), `R_cam_imu` (3, 3), `gyro_bias` (3,) rad/s, `correlation`
+    of the rates of turn, and how strongly the turning spans three dimensions (`excitation`, rad/s, smallest of three)."""
+
+    shift_s: float
+    R_cam_imu: np.ndarray
+    gyro_bias: np.ndarray
+    correlation: float
+    excitation: np.ndarray
+
+
+class TurnIntegral:
+    """Integral of the gyroscope over time, so that mean rates over any span are two look-ups."""
+
+    def __init__(self, time_s: np.ndarray, gyro: np.ndarray):
+        step = np.diff(time_s)[:, None]
+        self._time = time_s
+        self._integral = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * step * (gyro[1:] + gyro[:-1]), axis=0)])
+
+    def mean_rate(self, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+        """Mean angular velocity (n, 3) over spans; NaN where a span leaves the recording."""
+        ends = [np.stack([np.interp(t, self._time, self._integral[:, a]) for a in range(3)], axis=1) for t in (start, stop)]
+        rate = (ends[1] - ends[0]) / (stop - start)[:, None]
+        outside = (start < self._time[0]) | (stop > self._time[-1])
+        rate[outside] = np.nan
+        return rate
+
+
+def align(track: CameraTrack, imu_time_s: np.ndarray, gyro: np.ndarray, name: str) -> Alignment:
+    """Align a camera's turning with the gyroscope's.
+
+    The offset is the peak of the correlation of the rates' magnitudes, refined below the grid by the residual of the
+    best rotation (Kabsch 1976) over neighbouring offsets. Raises CalibrationError when the two do not move together or
+    hardly turn.
+    """
+    start, stop, rate = _camera_rates(track, name)
+    integral = TurnIntegral(imu_time_s, gyro)
+    turning = np.sqrt(np.median(np.sum(rate**2, axis=1)))
+    if turning < _LEAST_TURNING:
+        raise CalibrationError(
+            f"{name}: the camera hardly turns (median {np.degrees(turning):.1f} deg/s), so that its rotation and time "
+            "offset to the IMU are not determined. Record with rotations about all three axes."
+        )
+    coarse, correlation = _coarse_shift(start, stop, rate, integral)
+    if correlation < _LEAST_CORRELATION:
+        raise CalibrationError(
+            f"{name}: its turning does not match the IMU's (correlation {correlation:.2f} at best, within "
+            f"{_LARGEST_SHIFT_S:g} s). Are camera and IMU from the same recording, on clocks less than "
+            f"{_LARGEST_SHIFT_S:g} s apart, and is the gyroscope in rad/s?"
+        )
+    grid = coarse + np.arange(-15, 16) * _FINE_STEP_S
+    costs = np.array([_rotation(start + s, stop + s, rate, integral)[2] for s in grid])
+    best = int(np.clip(np.argmin(costs), 1, len(grid) - 2))
+    left, middle, right = costs[best - 1 : best + 2]
+    bend = left - 2.0 * middle + right
+    shift = float(grid[best] + (0.5 * (left - right) / bend if bend > 0 else 0.0) * _FINE_STEP_S)
+    R_imu_cam, bias, _, spread = _rotation(start + shift, stop + shift, rate, integral)
+    return Alignment(shift, R_imu_cam.T, bias, correlation, spread)
+
+
+def _camera_rates(track: CameraTrack, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Spans between consecutive frames (start, stop) and the mean rate of turn in each, camera frame."""
+    step = np.diff(track.time_s)
+    near = step < _LONGEST_STEP_S
+    if near.sum() < 10:
+        raise CalibrationError(
+            f"{name}: only {near.sum()} pairs of frames with the board lie closer than {_LONGEST_STEP_S:g} s; the "
+            "motion cannot be followed. Record at 10 Hz or more and keep the board in view."
+        )
+    relative = track.rotation[:-1].swapaxes(-1, -2) @ track.rotation[1:]
+    rate = Rotation.from_matrix(relative[near]).as_rotvec() / step[near, None]
+    return track.time_s[:-1][near], track.time_s[1:][near], rate
+
+
+def _coarse_shift(
+    start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral
+) -> tuple[float, float]:
+    """Offset with the largest correlation of rate magnitudes over at least half of the spans."""
+    magnitude = np.linalg.norm(rate, axis=1)
+    best = (0.0, -1.0)
+    count = round(_LARGEST_SHIFT_S / _COARSE_STEP_S)
+    for k in range(-count, count + 1):
+        shift = k * _COARSE_STEP_S
+        other = np.linalg.norm(integral.mean_rate(start + shift, stop + shift), axis=1)
+        inside = np.isfinite(other)
+        if inside.sum() < 0.5 * len(magnitude):
+            continue
+        a, b = np.minimum(magnitude[inside], 20.0), other[inside]
+        spread = np.std(a) * np.std(b)
+        correlation = float(np.mean((a - a.mean()) * (b - b.mean())) / spread) if spread > 0 else 0.0
+        # Among equals the smaller offset is the likelier.
+        if correlation > best[1] + 1e-9:
+            best = (shift, correlation)
+    return best
+
+
+def _rotation(
+    start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral
+) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+    """R_imu_cam, gyro bias, trimmed cost and excitation of the best rotation between rates, worst fifth left out."""
+    measured = integral.mean_rate(start, stop)
+    inside = np.isfinite(measured[:, 0])
+    camera, imu = rate[inside], measured[inside]
+    kept = np.ones(len(camera), dtype=bool)
+    R, bias, error, values = np.eye(3), np.zeros(3), np.zeros(len(camera)), np.zeros(3)
+    for _ in range(4):
+        mean_camera, mean_imu = camera[kept].mean(axis=0), imu[kept].mean(axis=0)
+        covariance = (imu[kept] - mean_imu).T @ (camera[kept] - mean_camera)
+        u, values, vt = np.linalg.svd(covariance)
+        R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        bias = mean_imu - R @ mean_camera
+        error = np.sum((imu - camera @ R.T - bias) ** 2, axis=1)
+        kept = error <= np.quantile(error, _TRIM)
+    return R, bias, float(np.mean(error[kept])), np.sqrt(values / max(kept.sum(), 1))
+
+
+def orientation_track(
+    time_s: np.ndarray, rotation: np.ndarray, imu_time_s: np.ndarray, gyro: np.ndarray
+) -> np.ndarray:
+    """R_target_imu (N, 3, 3) at every IMU sample: the gyroscope's integral, bent to pass through the frames' orientations.
+
+    `time_s` (F,) frames on the IMU's clock, increasing; `rotation` (F, 3, 3) R_target_imu there. Gaps between frames
+    are carried by the gyroscope alone.
+    """
+    steps = Rotation.from_rotvec(0.5 * (gyro[1:] + gyro[:-1]) * np.diff(imu_time_s)[:, None])
+    integral = _running_product(steps)
+    at_frames = Slerp(imu_time_s, integral)(np.clip(time_s, imu_time_s[0], imu_time_s[-1]))
+    correction = Rotation.from_matrix(rotation) * at_frames.inv()
+    smooth = Slerp(time_s, correction)(np.clip(imu_time_s, time_s[0], time_s[-1]))
+    return (smooth * integral).as_matrix()
+
+
+def _running_product(steps: Rotation) -> Rotation:
+    """Identity, s0, s0 s1, s0 s1 s2, ...: a prefix product in log2(N) vectorised passes."""
+    quaternions = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], steps.as_quat()])
+    reach = 1
+    while reach < len(quaternions):
+        product = Rotation.from_quat(quaternions[:-reach]) * Rotation.from_quat(quaternions[reach:])
+        quaternions = np.concatenate([quaternions[:reach], product.as_quat()])
+        reach *= 2
+    return Rotation.from_quat(quaternions)
+
+
+def gravity_from(rotation: np.ndarray, accel: np.ndarray) -> np.ndarray:
+    """Gravity (3,) in the target frame: accelerations average out over a recording that starts and ends at a similar
+    speed, gravity does not. `rotation` (N, 3, 3) R_target_imu, `accel` (N, 3)."""
+    mean = np.einsum("nij,nj->i", rotation, accel) / len(accel)
+    return -mean * (STANDARD_GRAVITY / np.linalg.norm(mean))
+
+
+def lever_arms(
+    reference: CameraTrack, others: Sequence[CameraTrack], shifts: Sequence[float], reference_shift: float
+) -> list[np.ndarray]:
+    """Position (3,) of the reference camera in each other camera's frame, from positions at equal times.
+
+    Tracks need not be synchronised: the reference is interpolated between frames closer than the longest step.
+    """
+    time = reference.time_s + reference_shift
+    arms = []
+    for track, shift in zip(others, shifts, strict=True):
+        at = track.time_s + shift
+        after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
+        near = (at >= time[0]) & (at <= time[-1]) & (time[after] - time[after - 1] < _LONGEST_STEP_S)
+        if near.sum() < 5:
+            arms.append(np.zeros(3))
+            continue
+        position = np.stack([np.interp(at[near], time, reference.position[:, a]) for a in range(3)], axis=1)
+        local = np.einsum("fji,fj->fi", track.rotation[near], position - track.position[near])
+        arms.append(np.median(local, axis=0))
+    return arms
+
+
+def check_coverage(tracks: Sequence[CameraTrack], shifts: Sequence[float], imu: ImuRecording, imu_time_s: np.ndarray) -> None:
+    """Raise CalibrationError when frames and IMU hardly overlap in time."""
+    spans = [(t.time_s[0] + s, t.time_s[-1] + s) for t, s in zip(tracks, shifts, strict=True)]
+    first, last = max(min(a for a, _ in spans), imu_time_s[0]), min(max(b for _, b in spans), imu_time_s[-1])
+    if last - first < 1.0:
+        raise CalibrationError(
+            f"the frames ({min(a for a, _ in spans):.1f} to {max(b for _, b in spans):.1f} s) and the IMU "
+            f"({imu_time_s[0]:.1f} to {imu_time_s[-1]:.1f} s, {len(imu)} samples) share less than a second. "
+            "Are both on the same clock?"
+        )

@@ -1,0 +1,137 @@
+"""Knots of the trajectory spline: how dense, where, and with which first values; IMU samples binned between them."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.interpolate import CubicSpline, PchipInterpolator, make_lsq_spline
+from scipy.spatial.transform import Rotation, Slerp
+
+from jaxcal.calibration.assemble import round_up
+from jaxcal.calibration.inertial import INTERVAL_BATCH, InertialData
+from jaxcal.observations import ImuNoise
+
+_RATES_HZ = (10.0, 15.0, 20.0, 30.0, 45.0, 70.0, 100.0)
+# A knot rate is dense enough when a denser one lowers the IMU's residual by less than this share.
+_ENOUGH = 1.05
+
+
+@dataclass(frozen=True)
+class SplineGrid:
+    """A uniform spline of `order` with `intervals` intervals of `dt` s from `start` s on the IMU's clock; the last
+    `intervals - used` only round the size up."""
+
+    start: float
+    dt: float
+    order: int
+    used: int
+    intervals: int
+
+    @property
+    def stop(self) -> float:
+        return self.start + self.used * self.dt
+
+    @property
+    def control_times(self) -> np.ndarray:
+        """Centre of each control point's influence (Greville abscissae), s."""
+        count = self.intervals + self.order - 1
+        return self.start + (np.arange(count) - 0.5 * (self.order - 2)) * self.dt
+
+
+def make_grid(start: float, stop: float, order: int, knot_rate_hz: float) -> SplineGrid:
+    """A grid that covers [start, stop]."""
+    dt = 1.0 / knot_rate_hz
+    used = max(int(np.ceil((stop - start) / dt)), 1)
+    return SplineGrid(start, dt, order, used, round_up(used, INTERVAL_BATCH))
+
+
+def choose_knot_rate(time_s: np.ndarray, gyro: np.ndarray, accel: np.ndarray, order: int) -> float:
+    """The sparsest knot rate (Hz) whose spline follows the IMU as well as denser ones do.
+
+    Least-squares splines of the degrees that angular velocity and acceleration have are fitted to the readings at
+    rising knot rates, on the even samples, and judged on the odd ones: while the held-back residual still falls, the
+    sparser spline was missing motion rather than noise.
+    """
+    rate_limit = 0.4 / np.median(np.diff(time_s))
+    rates = [rate for rate in _RATES_HZ if rate <= rate_limit] or [_RATES_HZ[0]]
+    scores = []
+    for rate in rates:
+        errors = [
+            _held_back_error(time_s, values, rate, degree)
+            for values, degree in ((gyro, order - 2), (accel, max(order - 3, 1)))
+        ]
+        scores.append(errors)
+    table = np.array(scores)
+    best = table.min(axis=0)
+    dense_enough = np.all(table <= _ENOUGH * best, axis=1)
+    return float(rates[int(np.argmax(dense_enough))])
+
+
+def _held_back_error(time_s: np.ndarray, values: np.ndarray, rate: float, degree: int) -> float:
+    count = max(int((time_s[-1] - time_s[0]) * rate), 2)
+    inner = np.linspace(time_s[0], time_s[-1], count + 1)
+    train_t, train_v = time_s[::2], values[::2]
+    filled = np.unique(np.searchsorted(inner, train_t, side="right"))
+    if len(filled) < count:  # a gap in the recording: keep only knots with samples between them
+        inner = inner[np.concatenate([[0], np.intersect1d(filled, np.arange(1, count)), [count]])]
+    knots = np.concatenate([[inner[0]] * degree, inner, [inner[-1]] * degree])
+    test = slice(1, None, 2)
+    inside = time_s[test] <= train_t[-1]
+    try:
+        spline = make_lsq_spline(train_t, train_v, knots, k=degree)
+    except (ValueError, np.linalg.LinAlgError):  # too few samples between some knots for this rate
+        return np.inf
+    return float(np.sqrt(np.mean((spline(time_s[test][inside]) - values[test][inside]) ** 2)))
+
+
+def first_chain(
+    grid: SplineGrid,
+    orientation_time_s: np.ndarray,
+    orientation: np.ndarray,
+    position_time_s: np.ndarray,
+    position: np.ndarray,
+    gyro_bias: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """First control rotations (K, 3, 3), positions (K, 3) and biases (K, 6): the curves' values at the control times."""
+    times = grid.control_times
+    clipped = np.clip(times, orientation_time_s[0], orientation_time_s[-1])
+    rotations = Slerp(orientation_time_s, Rotation.from_matrix(orientation))(clipped).as_matrix()
+    clipped = np.clip(times, position_time_s[0], position_time_s[-1])
+    gaps = np.max(np.diff(position_time_s), initial=0.0)
+    # A cubic spline is smoother, but overshoots across gaps.
+    curve = CubicSpline(position_time_s, position) if gaps < 0.3 else PchipInterpolator(position_time_s, position)
+    biases = np.tile(np.concatenate([gyro_bias, np.zeros(3)]), (len(times), 1))
+    return rotations, np.asarray(curve(clipped)), biases
+
+
+def bin_imu(
+    grid: SplineGrid, time_s: np.ndarray, gyro: np.ndarray, accel: np.ndarray, noise: ImuNoise, rate_hz: float
+) -> tuple[InertialData, np.ndarray, np.ndarray]:
+    """IMU samples by knot interval. Returns the data, and for each sample used its (interval, slot) and its index."""
+    inside = np.flatnonzero((time_s >= grid.start) & (time_s < grid.stop))
+    place = (time_s[inside] - grid.start) / grid.dt
+    interval = np.minimum(np.floor(place).astype(int), grid.used - 1)
+    first = np.searchsorted(interval, np.arange(grid.intervals))
+    slot = np.arange(len(inside)) - first[interval]
+    slots = round_up(int(slot.max(initial=0)) + 1, 2)
+    fraction = np.zeros((grid.intervals, slots))
+    readings = np.zeros((grid.intervals, slots, 6))
+    present = np.zeros((grid.intervals, slots))
+    fraction[interval, slot] = place - interval
+    readings[interval, slot] = np.concatenate([gyro[inside], accel[inside]], axis=1)
+    present[interval, slot] = 1.0
+    # A density becomes the noise of one sample by the root of the rate, a random walk's step by the root of the time.
+    sample = np.sqrt(rate_hz)
+    step = np.sqrt(grid.dt)
+    data = InertialData(
+        fraction=jnp.asarray(fraction),
+        readings=jnp.asarray(readings),
+        present=jnp.asarray(present),
+        inverse_sigma=jnp.asarray(
+            np.repeat([1.0 / (noise.gyro_noise_density * sample), 1.0 / (noise.accel_noise_density * sample)], 3)
+        ),
+        walk_sigma=jnp.asarray(np.repeat([noise.gyro_random_walk * step, noise.accel_random_walk * step], 3)),
+        start=jnp.asarray(grid.start),
+        dt=jnp.asarray(grid.dt),
+    )
+    return data, np.stack([interval, slot], axis=1), inside
