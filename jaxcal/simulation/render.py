@@ -1,0 +1,212 @@
+"""Images of a planar pattern through any camera model, antialiased in closed form."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32, Int32
+
+from jaxcal.cameras import CameraModel
+from jaxcal.simulation.pattern import Pattern
+
+# The pixel's own area blurs like a Gaussian of this variance (px^2).
+_PIXEL_VARIANCE = 1.0 / 12.0
+# Gauss-Hermite nodes for a standard normal.
+_NODES = ((-np.sqrt(3.0), 1.0 / 6.0), (0.0, 2.0 / 3.0), (np.sqrt(3.0), 1.0 / 6.0))
+_FAR = 1e6  # metres; where the background ends
+_BEHIND = 1e-6  # 1 / metres; inverse depth below which a ray misses the plane
+
+
+class PixelRays(NamedTuple):
+    """Rays of some pixels: `ray` (3, N) of unit length, `per_pixel` (3, 2, N) their change per pixel.
+
+    Pixels run along the last axis, so that compiled loops read them in a row.
+    """
+
+    ray: Float32[Array, "3 n"]
+    per_pixel: Float32[Array, "3 2 n"]
+
+
+class Lines(NamedTuple):
+    """Lines of a pattern along one axis, ends of the background included, and a table to find intervals by.
+
+    Bin b of the table starts at `start` + b / `bins_per_metre` and holds at most one line; `first` (B,) is the
+    interval in which it starts.
+    """
+
+    at: Float32[Array, " n"]
+    start: Float32[Array, ""]
+    bins_per_metre: Float32[Array, ""]
+    first: Int32[Array, " b"]
+
+
+class Surface(NamedTuple):
+    """A pattern made ready for rendering: its lines, and the reflectance of each cell's 3 x 3 neighbourhood."""
+
+    x: Lines
+    y: Lines
+    neighbours: Float32[Array, "cells 9"]
+
+
+def surface_of(pattern: Pattern) -> Surface:
+    """Prepare a pattern for `render`."""
+    padded = np.pad(pattern.reflectance, 2, constant_values=pattern.background)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    return Surface(
+        _lines(pattern.x_lines), _lines(pattern.y_lines), jnp.asarray(windows.reshape(-1, 9), dtype=jnp.float32)
+    )
+
+
+def _lines(inner: np.ndarray) -> Lines:
+    bins_per_metre = 1.01 / np.min(np.diff(inner))
+    start = inner[0] - 0.5 / bins_per_metre
+    bins = start + np.arange(int((inner[-1] - start) * bins_per_metre) + 3) / bins_per_metre
+    at, start, rate = (
+        jnp.asarray(v, dtype=jnp.float32) for v in (np.concatenate([[-_FAR], inner, [_FAR]]), start, bins_per_metre)
+    )
+    return Lines(at, start, rate, jnp.asarray(np.searchsorted(inner, bins, side="right"), dtype=jnp.int32))
+
+
+def pixel_rays(model: CameraModel, image_size: tuple[int, int]) -> PixelRays:
+    """Rays of all pixels of a camera, row by row. Pixels outside the lens' domain look backwards, so see background."""
+    width, height = image_size
+    v, u = np.mgrid[:height, :width]
+    pixels = jnp.asarray(np.stack([u, v], axis=-1).reshape(-1, 2), dtype=jnp.float64)
+    return _pixel_rays(model, pixels)
+
+
+@eqx.filter_jit
+def _pixel_rays(model: CameraModel, pixels: Float[Array, "n 2"]) -> PixelRays:
+    rays = model.unproject(pixels)
+    found = jnp.linalg.norm(model.project(rays) - pixels, axis=-1) < 1e-4
+    valid = found & jax.vmap(model.is_valid)(rays)
+
+    def inverse(ray: Float[Array, "3"]) -> Float[Array, "3 2"]:
+        jacobian = jax.jacfwd(model.project)(ray)  # (2, 3); the ray itself is its null space
+        return jacobian.T @ jnp.linalg.inv(jacobian @ jacobian.T)
+
+    rays = jnp.where(valid[:, None], rays, jnp.array([0.0, 0.0, -1.0]))
+    per_pixel = jnp.where(valid[:, None, None], jax.vmap(inverse)(rays), 1e-3)
+    return PixelRays(rays.T.astype(jnp.float32), jnp.moveaxis(per_pixel, 0, -1).astype(jnp.float32))
+
+
+def plane_from_camera(T_cam_target: np.ndarray) -> np.ndarray:
+    """Matrices (K, 3, 3) that map a ray to (X, Y, 1) / depth on the target plane, for poses (K, 4, 4)."""
+    return np.linalg.inv(T_cam_target[:, :3][:, :, [0, 1, 3]]).astype(np.float32)
+
+
+class _Footprint(NamedTuple):
+    """Where pixels look on the plane: position (m), its standard deviation per axis (m), and their correlation."""
+
+    x: Array
+    y: Array
+    sigma_x: Array
+    sigma_y: Array
+    correlation: Array
+
+
+def _footprint(rays: PixelRays, matrix: Float32[Array, "3 3"], sigma_px: float | Array) -> _Footprint:
+    """Ray-plane intersection, with the first-order image of a Gaussian of `sigma_px` in the image."""
+
+    # Written out by component: a contraction over axes of length 3 would be several times slower here.
+    def transform(column: Array) -> list[Array]:
+        return [matrix[i, 0] * column[0] + matrix[i, 1] * column[1] + matrix[i, 2] * column[2] for i in range(3)]
+
+    plane_x, plane_y, plane_w = transform(rays.ray)
+    ahead = plane_w > _BEHIND
+    depth = 1.0 / jnp.where(ahead, plane_w, 1.0)
+    # Rays that miss the plane see the background, far to the side.
+    x, y = jnp.where(ahead, plane_x * depth, 0.5 * _FAR), jnp.where(ahead, plane_y * depth, 0.5 * _FAR)
+    (ux, uy, uw), (vx, vy, vw) = transform(rays.per_pixel[:, 0]), transform(rays.per_pixel[:, 1])
+    xu, xv = (ux - x * uw) * depth, (vx - x * vw) * depth
+    yu, yv = (uy - y * uw) * depth, (vy - y * vw) * depth
+    length_x, length_y = jnp.sqrt(xu * xu + xv * xv) + 1e-12, jnp.sqrt(yu * yu + yv * yv) + 1e-12
+    correlation = (xu * yu + xv * yv) / (length_x * length_y)
+    return _Footprint(x, y, sigma_px * length_x, sigma_px * length_y, correlation)
+
+
+def _cell(lines: Lines, value: Array) -> tuple[Array, Array, Array]:
+    """Index of the interval of `lines` that holds each value, and the interval's two ends."""
+    # Clipped as a float: far values do not fit into an integer.
+    place = jnp.clip((value - lines.start) * lines.bins_per_metre, 0.0, lines.first.size - 1.0)
+    index = lines.first[place.astype(jnp.int32)]
+    index = index + (value >= lines.at[index + 1])
+    return index, lines.at[index], lines.at[index + 1]
+
+
+def _weights(low: Array, high: Array, value: Array, sigma: Array) -> tuple[Array, Array, Array]:
+    """Shares of a normal distribution below, within and above an interval."""
+    scale = np.float32(np.sqrt(0.5)) / sigma
+    below = 0.5 * (1.0 + jax.lax.erf((low - value) * scale))
+    above = 0.5 * (1.0 + jax.lax.erf((value - high) * scale))
+    return below, 1.0 - below - above, above
+
+
+def _shade(
+    rays: PixelRays, matrix: Float32[Array, "3 3"], surface: Surface, sigma_px: float | Array
+) -> Float32[Array, " n"]:
+    """Mean reflectance under each pixel's Gaussian footprint.
+
+    The footprint's two coordinates are correlated; given one shared component they are independent, and the mean is
+    a product of one-dimensional ones (normal shares of the cell and its neighbours). The shared component is
+    integrated by Gauss-Hermite quadrature. Exact as long as the footprint is smaller than the neighbouring cells.
+    """
+    at = _footprint(rays, matrix, sigma_px)
+    column, x_low, x_high = _cell(surface.x, at.x)
+    row, y_low, y_high = _cell(surface.y, at.y)
+    # The barrier keeps the compiler from gathering anew for each of the uses below.
+    near = jax.lax.optimization_barrier(surface.neighbours[row * (surface.x.at.size - 1) + column].T)
+    shared = jnp.abs(at.correlation)
+    alone, common_x = jnp.sqrt(jnp.maximum(1.0 - shared, 1e-3)), jnp.sqrt(shared)
+    common_y = common_x * jnp.sign(at.correlation)
+    total = jnp.zeros_like(at.x)
+    for node, weight in _NODES:
+        x = at.x + np.float32(node) * common_x * at.sigma_x
+        y = at.y + np.float32(node) * common_y * at.sigma_y
+        wx = _weights(x_low, x_high, x, alone * at.sigma_x)
+        wy = _weights(y_low, y_high, y, alone * at.sigma_y)
+        lines = [wx[0] * near[3 * k] + wx[1] * near[3 * k + 1] + wx[2] * near[3 * k + 2] for k in range(3)]
+        total = total + np.float32(weight) * (wy[0] * lines[0] + wy[1] * lines[1] + wy[2] * lines[2])
+    return total
+
+
+def blur_px(psf_sigma_px: float | Array) -> float:
+    """Standard deviation of lens blur and pixel area together, px."""
+    return float(np.sqrt(psf_sigma_px**2 + _PIXEL_VARIANCE))
+
+
+@jax.jit
+def render(
+    rays: PixelRays, matrices: Float32[Array, "k 3 3"], surface: Surface, blur: float | Float[Array, ""]
+) -> Float32[Array, "k n"]:
+    """Linear intensities (K, N) of N pixels at K poses; `matrices` from `plane_from_camera`, `blur` from `blur_px`."""
+    sigma = jnp.asarray(blur, dtype=jnp.float32)
+    return jax.lax.map(lambda matrix: _shade(rays, matrix, surface, sigma), matrices)
+
+
+@jax.jit
+def render_some(
+    rays: PixelRays,
+    chosen: Int32[Array, " m"],
+    matrices: Float32[Array, "k 3 3"],
+    surface: Surface,
+    blur: float | Float[Array, ""],
+) -> Float32[Array, "k m"]:
+    """`render` for the pixels with indices `chosen` (M,)."""
+    return render(PixelRays(rays.ray[:, chosen], rays.per_pixel[:, :, chosen]), matrices, surface, blur)
+
+
+@jax.jit
+def near_edges(rays: PixelRays, matrix: Float32[Array, "3 3"], surface: Surface, band_px: float) -> Bool[Array, " n"]:
+    """Which of N pixels lie within `band_px` of a line of the pattern, seen from one pose."""
+    at = _footprint(rays, matrix, 1.0)
+    band_x, band_y = band_px * at.sigma_x, band_px * at.sigma_y
+    _, x_low, x_high = _cell(surface.x, at.x)
+    _, y_low, y_high = _cell(surface.y, at.y)
+    close_x = jnp.minimum(at.x - x_low, x_high - at.x) < band_x
+    close_y = jnp.minimum(at.y - y_low, y_high - at.y) < band_y
+    inside_x = (at.x > surface.x.at[1] - band_x) & (at.x < surface.x.at[-2] + band_x)
+    inside_y = (at.y > surface.y.at[1] - band_y) & (at.y < surface.y.at[-2] + band_y)
+    return inside_x & inside_y & (close_x | close_y)
