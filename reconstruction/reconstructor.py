@@ -3,6 +3,7 @@
 import logging
 import os
 from collections import deque
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from reconstruction.networks.base import State
 from reconstruction.voxel import accumulate, normalise
 
 logger = logging.getLogger(__name__)
+
+# (K, 2) columns and rows, or a text file of them.
+HotPixels = np.ndarray | Sequence[Sequence[int]] | str | os.PathLike[str]
 
 # As the reference: after a longer silence, or when time jumps back, the old state is worth nothing.
 _MAX_SILENCE_US = 5_000_000
@@ -56,7 +60,7 @@ class Reconstructor:
         Imax: float = 1.0,
         auto_hdr: bool = False,
         auto_hdr_median_filter_size: int = 10,
-        hot_pixels: np.ndarray | str | os.PathLike[str] | None = None,
+        hot_pixels: HotPixels | None = None,
         flip: bool = False,
         no_normalize: bool = False,
         no_recurrent: bool = False,
@@ -202,14 +206,12 @@ def _bilateral(image: np.ndarray, sigma: float) -> np.ndarray:
     return np.asarray(cv2.bilateralFilter(image, 5, 25.0 * sigma, 25.0 * sigma), dtype=np.uint8)
 
 
-def _working_cells(
-    hot_pixels: np.ndarray | str | os.PathLike[str] | None, width: int, height: int
-) -> np.ndarray | None:
+def _working_cells(hot_pixels: HotPixels | None, width: int, height: int) -> np.ndarray | None:
     """(H, W) float32 ones with zeros at the hot pixels, or None when there are none."""
     if hot_pixels is None:
         return None
     place = "hot_pixels"
-    if not isinstance(hot_pixels, np.ndarray | list | tuple):
+    if isinstance(hot_pixels, str | os.PathLike):
         place = str(hot_pixels)
         try:
             hot_pixels = np.loadtxt(Path(hot_pixels), delimiter=",", ndmin=2)

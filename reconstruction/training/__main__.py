@@ -21,7 +21,9 @@ class _Bars:
         self._bars: dict[str, tqdm] = {}
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        bar = self._bars.setdefault(stage, tqdm(total=total, desc=stage, mininterval=5.0))
+        if stage not in self._bars:
+            self._bars[stage] = tqdm(total=total, desc=stage, mininterval=5.0)
+        bar = self._bars[stage]
         bar.update(done - bar.n)
         if done == total:
             bar.close()

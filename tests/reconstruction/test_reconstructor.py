@@ -1,0 +1,265 @@
+"""The reconstructor: state, reset, sizes, silence, options; with a small network of random weights."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import reconstruction
+from jaxcal.errors import CalibrationError
+from jaxcal.observations import Events
+from reconstruction.networks import E2VIDRecurrent, FireNet, FoldedFireNet, ReconstructionNetwork
+from reconstruction.reconstructor import unsharp_kernel
+
+Window = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+NOTHING: Window = tuple(np.zeros(0, dtype=np.int64) for _ in range(4))  # pyright: ignore[reportAssignmentType]
+
+
+def make_network(kind: str = "folded") -> ReconstructionNetwork:
+    torch.manual_seed(5)
+    network = {
+        "folded": lambda: FoldedFireNet(channels=8),
+        "e2vid": lambda: E2VIDRecurrent(base_num_channels=4, num_encoders=3, num_residual_blocks=1),
+        "firenet": lambda: FireNet(base_num_channels=4),
+    }[kind]()
+    if kind != "e2vid":
+        with torch.no_grad():  # an output in the middle of the grey scale
+            (network.body if kind == "folded" else network.net).pred.conv2d.bias.fill_(0.5)  # pyright: ignore
+    return network.eval().requires_grad_(False)
+
+
+def make_window(width: int, height: int, seed: int, start_us: int = 0, count: int = 300) -> Window:
+    rng = np.random.default_rng(seed)
+    t = start_us + np.sort(rng.integers(0, 20_000, count))
+    return rng.integers(0, width, count), rng.integers(0, height, count), t, rng.integers(0, 2, count)
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(1, 45), st.integers(1, 45), st.sampled_from(["folded", "e2vid", "firenet"]))
+def test_any_sensor_size_gives_an_image_of_that_size(width: int, height: int, kind: str):
+    reconstructor = reconstruction.Reconstructor(make_network(kind), width, height)
+    for index in range(2):
+        image = reconstructor(*make_window(width, height, index, 20_000 * index))
+        assert image.shape == (height, width)
+        assert image.dtype == np.uint8
+
+
+class _MeanOfBins(ReconstructionNetwork):
+    """No learning: shows where the reconstructor puts each pixel."""
+
+    def __init__(self, multiple: int):
+        super().__init__()
+        self.num_bins, self.multiple, self.settings = 5, multiple, {}
+
+    def forward(self, voxels: torch.Tensor, state: list | None) -> tuple[torch.Tensor, list]:
+        assert voxels.shape[-1] % self.multiple == voxels.shape[-2] % self.multiple == 0
+        return voxels.mean(dim=1, keepdim=True), []
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(1, 40), st.integers(1, 40), st.sampled_from([1, 2, 8, 16]))
+def test_padding_does_not_shift_the_image(width: int, height: int, multiple: int):
+    window = make_window(width, height, 1)
+    image = reconstruction.Reconstructor(
+        _MeanOfBins(multiple), width, height, unsharp_mask_amount=0.0, Imin=-1.0, Imax=1.0
+    )(*window)
+    expected = 255 * (reconstruction.voxel_grid(*window, width=width, height=height).mean(axis=0) + 1) / 2
+    assert np.abs(image - expected.clip(0, 255)).max() <= 1.0
+
+
+def test_state_carries_over_and_reset_clears_it():
+    reconstructor = reconstruction.Reconstructor(make_network(), 32, 24)
+    first, second = make_window(32, 24, 1), make_window(32, 24, 2, 20_000)
+    one, two = reconstructor(*first), reconstructor(*second)
+    reconstructor.reset()
+    np.testing.assert_array_equal(reconstructor(*first), one)
+    np.testing.assert_array_equal(reconstructor(*second), two)
+    reconstructor.reset()
+    assert (reconstructor(*second) != two).any()
+
+
+def test_two_reconstructors_share_a_network_without_disturbing_each_other():
+    network = make_network()
+    alone = reconstruction.Reconstructor(network, 32, 24)
+    expected = [alone(*make_window(32, 24, seed, 20_000 * seed)) for seed in range(3)]
+    left, right = (reconstruction.Reconstructor(network, 32, 24) for _ in range(2))
+    for seed in range(3):
+        window = make_window(32, 24, seed, 20_000 * seed)
+        np.testing.assert_array_equal(left(*window), expected[seed])
+        right(*make_window(32, 24, 50 + seed, 20_000 * seed))
+
+
+def test_no_recurrent_forgets():
+    reconstructor = reconstruction.Reconstructor(make_network(), 32, 24, no_recurrent=True)
+    window = make_window(32, 24, 1)
+    np.testing.assert_array_equal(reconstructor(*window), reconstructor(*window))
+
+
+def test_a_window_without_events_repeats_the_last_image_and_keeps_the_state():
+    quiet, steady = (reconstruction.Reconstructor(make_network(), 32, 24) for _ in range(2))
+    assert (quiet(*NOTHING) == 127).all()
+    first, second = make_window(32, 24, 1), make_window(32, 24, 2, 20_000)
+    image = quiet(*first)
+    np.testing.assert_array_equal(image, steady(*first))
+    repeated = quiet(*NOTHING)
+    np.testing.assert_array_equal(repeated, image)
+    repeated[:] = 0  # the caller may do as it likes with its image
+    np.testing.assert_array_equal(quiet(*NOTHING), image)
+    np.testing.assert_array_equal(quiet(*second), steady(*second))
+
+
+@pytest.mark.parametrize("start_us", [-1_000_000, 6_000_000])
+def test_a_jump_in_time_starts_anew(start_us: int, caplog: pytest.LogCaptureFixture):
+    reconstructor, fresh = (reconstruction.Reconstructor(make_network(), 32, 24) for _ in range(2))
+    reconstructor(*make_window(32, 24, 1))
+    later = make_window(32, 24, 2, start_us)
+    with caplog.at_level(logging.INFO, logger="reconstruction"):
+        image = reconstructor(*later)
+    np.testing.assert_array_equal(image, fresh(*later))
+    assert "starts anew" in caplog.text
+
+
+def test_hot_pixels_have_no_influence(tmp_path):
+    window = make_window(32, 24, 1)
+    rest = np.ones(len(window[0]), dtype=bool)
+    rest[1:-1] = (window[0][1:-1] != 5) | (window[1][1:-1] != 6)
+    fires = ([5] * 90, [6] * 90, [19_000] * 90, [1] * 90)
+    hot = [np.concatenate([values, extra]) for values, extra in zip(window, fires, strict=True)]
+    order = np.argsort(hot[2], kind="stable")
+    clean = reconstruction.Reconstructor(make_network(), 32, 24, hot_pixels=np.array([[5, 6]]))
+    expected = clean(*(values[rest] for values in window))
+    (tmp_path / "hot.txt").write_text("5,6\n")
+    for place in ([[5, 6]], tmp_path / "hot.txt"):
+        masked = reconstruction.Reconstructor(make_network(), 32, 24, hot_pixels=place)
+        np.testing.assert_array_equal(masked(*(values[order] for values in hot)), expected)
+    assert (reconstruction.Reconstructor(make_network(), 32, 24)(*(values[order] for values in hot)) != expected).any()
+
+
+def test_flip_turns_image_and_events_by_half_a_turn():
+    x, y, t, p = make_window(32, 24, 1)
+    straight = reconstruction.Reconstructor(make_network(), 32, 24)(31 - x, 23 - y, t, p)
+    np.testing.assert_array_equal(reconstruction.Reconstructor(make_network(), 32, 24, flip=True)(x, y, t, p), straight)
+
+
+def test_fixed_bounds_scale_the_grey_levels():
+    options = {"unsharp_mask_amount": 0.0, "precision": "float32"}
+    window = make_window(32, 24, 1)
+    plain = reconstruction.Reconstructor(make_network(), 32, 24, **options)(*window).astype(float)
+    scaled = reconstruction.Reconstructor(make_network(), 32, 24, Imin=0.25, Imax=0.75, **options)(*window)
+    expected = (255 * (plain / 255 - 0.25) / 0.5).clip(0, 255)
+    assert np.abs(scaled - expected).max() <= 2.0  # two images cut to whole grey levels
+
+
+def test_auto_hdr_follows_the_median_of_the_extremes():
+    """Written out from the reference: bounds limited to 0..0.45 and 0.55..1, median over the last eleven images."""
+    network, windows = make_network("e2vid"), [make_window(32, 24, seed, 20_000 * seed) for seed in range(14)]
+    options = {"unsharp_mask_amount": 0.0}
+    raw = reconstruction.Reconstructor(network, 32, 24, **options)
+    raw_images, bounds = [], []
+    auto = reconstruction.Reconstructor(network, 32, 24, auto_hdr=True, **options)
+    for window in windows:
+        raw_images.append(raw(*window) / 255.0)
+        image = auto(*window)
+        bounds.append((min(raw_images[-1].min(), 0.45), max(raw_images[-1].max(), 0.55)))
+        low, high = np.median(bounds[-11:], axis=0)
+        expected = (255 * (raw_images[-1] - low) / (high - low)).clip(0, 255)
+        assert np.abs(image - expected).max() <= 2 + 1 / (high - low)
+
+
+def test_unsharp_kernel_is_the_references():
+    """Values of the reference's gkern(5, 1.0): the square root makes it a one-dimensional product of its own."""
+    kernel = unsharp_kernel(1.0)[0, 0].numpy()
+    assert kernel.sum() == pytest.approx(1.0, abs=1e-6)
+    np.testing.assert_allclose(kernel, kernel.T)
+    np.testing.assert_allclose(kernel, kernel[::-1, ::-1], atol=1e-7)
+    row = kernel[2] / kernel[2, 2]
+    # Five cells from -1.3 to 1.3, with these shares of a standard normal distribution.
+    np.testing.assert_allclose(row**2, np.array([0.12090, 0.17974, 0.20514, 0.17974, 0.12090]) / 0.20514, atol=1e-4)
+
+
+def test_unsharp_mask_sharpens():
+    window = make_window(32, 24, 1)
+    soft = reconstruction.Reconstructor(make_network(), 32, 24, unsharp_mask_amount=0.0)(*window)
+    sharp = reconstruction.Reconstructor(make_network(), 32, 24, unsharp_mask_amount=2.0)(*window)
+    assert (
+        np.abs(np.diff(sharp[4:-4].astype(int), axis=1)).mean() > np.abs(np.diff(soft[4:-4].astype(int), axis=1)).mean()
+    )
+
+
+def test_bilateral_filter_smooths():
+    window = make_window(32, 24, 1)
+    plain = reconstruction.Reconstructor(make_network(), 32, 24)(*window)
+    smooth = reconstruction.Reconstructor(make_network(), 32, 24, bilateral_filter_sigma=2.0)(*window)
+    assert smooth.dtype == np.uint8
+    assert np.abs(np.diff(smooth.astype(int))).mean() < np.abs(np.diff(plain.astype(int))).mean()
+
+
+def test_bfloat16_stays_close_to_float32():
+    images = [
+        reconstruction.Reconstructor(make_network(), 32, 24, precision=precision)(*make_window(32, 24, 1))
+        for precision in ("float32", "bfloat16")
+    ]
+    assert np.abs(images[0].astype(int) - images[1]).max() <= 4
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"width": 0}, "0x24"),
+        ({"Imin": 0.5, "Imax": 0.5}, "Imax"),
+        ({"unsharp_mask_amount": -1.0}, "must not be negative"),
+        ({"precision": "float8"}, "float8"),
+        ({"hot_pixels": np.array([[32, 0]])}, r"\(32, 0\) lies outside"),
+        ({"hot_pixels": "/nowhere/hot.txt"}, "/nowhere/hot.txt: hot pixels unreadable"),
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict, words: str):
+    with pytest.raises(CalibrationError, match=words):
+        reconstruction.Reconstructor(make_network(), **({"width": 32, "height": 24} | options))
+
+
+def _events(window: Window, origin_ns: int) -> Events:
+    x, y, t, p = window
+    return Events(origin_ns + 1000 * t, x.astype(np.uint16), y.astype(np.uint16), p.astype(bool), 32, 24)
+
+
+def test_stream_gives_the_reconstructors_images_at_the_windows_ends():
+    origin = 1_600_000_000_000_000_000
+    windows = [make_window(32, 24, seed, 20_000 * seed) for seed in range(4)]
+    ends = [origin + 20_000_000 * (seed + 1) for seed in range(4)]
+    stream = reconstruction.reconstruct(
+        ((end, _events(window, origin)) for end, window in zip(ends, windows, strict=True)),
+        make_network(),
+        width=32,
+        height=24,
+        unsharp_mask_amount=0.1,
+    )
+    reconstructor = reconstruction.Reconstructor(make_network(), 32, 24, unsharp_mask_amount=0.1)
+    for end, window, (t_ns, image) in zip(ends, windows, stream, strict=True):
+        assert t_ns == end
+        np.testing.assert_array_equal(image, reconstructor(*window))
+
+
+def test_stream_is_lazy():
+    drawn = []
+
+    def windows():
+        for seed in range(100):
+            drawn.append(seed)
+            yield 20_000_000 * (seed + 1), _events(make_window(32, 24, seed, 20_000 * seed), 0)
+
+    stream = reconstruction.reconstruct(windows(), make_network(), width=32, height=24)
+    next(stream)
+    next(stream)
+    assert drawn == [0, 1]
+
+
+def test_stream_refuses_windows_out_of_order_and_late_events():
+    events = _events(make_window(32, 24, 0), 0)
+    with pytest.raises(CalibrationError, match="must come in order of time"):
+        list(reconstruction.reconstruct([(10**9, events), (10**9, events)], make_network(), width=32, height=24))
+    with pytest.raises(CalibrationError, match="ends at 5 ns holds an event"):
+        list(reconstruction.reconstruct([(5, events)], make_network(), width=32, height=24))

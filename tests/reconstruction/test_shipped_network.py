@@ -1,0 +1,72 @@
+"""The network that is shipped: it is the file its card speaks of, and cv2 finds the board in what it reconstructs."""
+
+import hashlib
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import reconstruction
+from reconstruction.checkpoints import DEFAULT_NETWORK, MODELS_FOLDER, read_metadata
+from reconstruction.training.evaluate import evaluate, find_corners
+from reconstruction.training.sequences import evaluation_scene, windows
+
+WEIGHTS = MODELS_FOLDER / f"{DEFAULT_NETWORK}.safetensors"
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def test_default_is_found_by_name_and_path():
+    default = reconstruction.load_network()
+    voxels = torch.randn(1, default.num_bins, 16, 16)
+    for place in (DEFAULT_NETWORK, WEIGHTS, str(WEIGHTS)):
+        assert torch.equal(reconstruction.load_network(place)(voxels, None)[0], default(voxels, None)[0])
+    assert not default.training
+    assert default.multiple == 2
+
+
+def test_card_speaks_of_this_file():
+    card = Path(WEIGHTS).with_suffix(".md").read_text(encoding="utf-8")
+    assert hashlib.sha256(WEIGHTS.read_bytes()).hexdigest() in card
+    assert f"{WEIGHTS.stat().st_size} bytes" in card
+    assert read_metadata(WEIGHTS)["licence"] in card
+    parameters = sum(tensor.numel() for tensor in reconstruction.load_network().parameters())
+    assert f"{parameters} parameters" in card
+
+
+@pytest.mark.slow
+def test_card_states_what_a_fresh_measurement_gives():
+    """Scenes of two speeds that the card's figures do not contain, held to the card's error with some room."""
+    card = WEIGHTS.with_suffix(".md").read_text(encoding="utf-8")
+    stated = re.search(r"corner error .*? \| ([\d.]+) \| ([\d.]+) \|", card)
+    assert stated
+    fresh = evaluate(reconstruction.load_network(), top_speeds=(3.5, 11.0), windows_each=14)
+    assert fresh.sharp.found >= 8
+    assert fresh.detection_ratio >= 0.95
+    assert fresh.reconstructed.rms_px < 1.4 * float(stated[1])
+    assert abs(fresh.reconstructed.latency_s) < 0.5e-3
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_board_is_found_in_what_it_reconstructs(precision: str):
+    scene = evaluation_scene(np.random.default_rng(4), 6, top_speed=8.0)
+    reconstructor = reconstruction.Reconstructor(
+        reconstruction.load_network(), scene.view.width, scene.view.height, precision=precision
+    )
+    for window in windows(scene, seed=4):
+        image = reconstructor(window.x, window.y, window.t_us, window.p)
+    corners = find_corners(image, (9, 6))
+    assert corners is not None
+    distance = np.linalg.norm(corners[:, None] - window.corners[None], axis=-1).min(axis=1)
+    assert np.sqrt((distance**2).mean()) < 0.5
+    # Black and white are where the targets of the training had them.
+    for truth, value in ((window.target < 0.1, 0.05), (window.target > 0.8, 0.9)):
+        assert np.median(image[truth]) == pytest.approx(255 * value, abs=18)

@@ -1,0 +1,194 @@
+"""Training: the scenes are what they claim, the loop learns, an interrupted run ends as an unbroken one does."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from reconstruction.networks import FoldedFireNet
+from reconstruction.training import loop
+from reconstruction.training.data import Dataset, load_or_generate
+from reconstruction.training.evaluate import CornerErrors, find_corners
+from reconstruction.training.motion import apply_homography, speed_profile
+from reconstruction.training.recipe import DataRecipe, Recipe, Stage, fingerprint
+from reconstruction.training.sequences import BLACK, WHITE, evaluation_scene, training_scene, windows
+
+TINY = Recipe(
+    data=DataRecipe(sequences=3, windows=8, size=32),
+    stages=(
+        Stage(crop=16, windows=4, segments=1, batch=2, clips=12),
+        Stage(crop=32, windows=4, segments=2, batch=1, clips=4),
+    ),
+    channels=4,
+    warm_up_steps=2,
+)
+
+
+@pytest.fixture(scope="module")
+def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return load_or_generate(TINY.data, TINY.num_bins, tmp_path_factory.mktemp("cache"))
+
+
+def _train(recipe: Recipe, dataset: Dataset, checkpoint: Path) -> dict[str, torch.Tensor]:
+    torch.set_num_threads(1)
+    network, _ = loop.train(recipe, dataset, checkpoint, checkpoint_every_s=0.0)
+    return network.state_dict()
+
+
+def test_an_interrupted_training_ends_as_an_unbroken_one(
+    tiny_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    assert TINY.steps == 20
+    unbroken = _train(TINY, tiny_dataset, tmp_path / "unbroken.pt")
+
+    train_on_clip = loop._train_on_clip
+
+    def power_cut(run: loop.Run, *arguments):
+        if run.step == 14:  # within the second stage
+            raise KeyboardInterrupt
+        train_on_clip(run, *arguments)
+
+    with monkeypatch.context() as context:
+        context.setattr(loop, "_train_on_clip", power_cut)
+        with pytest.raises(KeyboardInterrupt):
+            _train(TINY, tiny_dataset, tmp_path / "broken.pt")
+    continued: list[int] = []
+
+    def witness(run: loop.Run, *arguments):
+        continued.append(run.step)
+        train_on_clip(run, *arguments)
+
+    with monkeypatch.context() as context:
+        context.setattr(loop, "_train_on_clip", witness)
+        broken = _train(TINY, tiny_dataset, tmp_path / "broken.pt")
+    assert continued[0] == 14
+    for name, value in unbroken.items():
+        assert torch.equal(broken[name], value), name
+
+
+def test_a_checkpoint_of_another_recipe_is_not_continued(tiny_dataset: Dataset, tmp_path: Path):
+    _train(TINY, tiny_dataset, tmp_path / "run.pt")
+    other = Recipe(data=TINY.data, stages=TINY.stages[:1], channels=4, seed=9)
+    restarted = _train(other, tiny_dataset, tmp_path / "run.pt")
+    fresh = _train(other, tiny_dataset, tmp_path / "fresh.pt")
+    assert all(torch.equal(restarted[name], fresh[name]) for name in fresh)
+
+
+def test_training_reduces_the_loss_on_what_it_sees(tiny_dataset: Dataset, tmp_path: Path):
+    stage = Stage(crop=32, windows=8, segments=1, batch=2, clips=60)
+    recipe = Recipe(data=TINY.data, stages=(stage,), channels=16, warm_up_steps=2, learning_rate=5e-3)
+    voxels, targets = tiny_dataset.clip(np.random.default_rng(0), stage)
+
+    def loss(network: FoldedFireNet) -> float:
+        with torch.no_grad():
+            return loop._segment_loss(network, voxels, targets, None, 2, recipe)[0].item()
+
+    before = loss(loop._start(recipe).network)
+    trained, _ = loop.train(recipe, tiny_dataset, tmp_path / "run.pt")
+    assert loss(trained) < 0.6 * before
+
+
+def test_data_are_generated_once_and_completed_after_an_interruption(tmp_path: Path, tiny_dataset: Dataset):
+    stages: list[tuple[int, int]] = []
+    first = load_or_generate(TINY.data, 5, tmp_path)
+    folder = next(tmp_path.iterdir())
+    sequence = folder / "0001.npz"
+    kept = (folder / "0000.npz").stat().st_mtime_ns
+    voxels = np.array(first.voxels)
+    for name in ("voxels.npy", "targets.npy", "0001.npz"):
+        (folder / name).unlink()
+    again = load_or_generate(TINY.data, 5, tmp_path, lambda _, done, total: stages.append((done, total)))
+    assert sequence.exists()
+    assert (folder / "0000.npz").stat().st_mtime_ns == kept
+    np.testing.assert_array_equal(again.voxels, voxels)
+    np.testing.assert_array_equal(again.voxels, tiny_dataset.voxels)  # and they depend on the recipe only
+    assert stages[-1] == (3, 3)
+    assert voxels.shape == (3, 8, 5, 32, 32)
+
+
+def test_fingerprint_changes_with_any_setting():
+    assert fingerprint(TINY) != fingerprint(Recipe())
+    assert fingerprint(DataRecipe()) != fingerprint(DataRecipe(seed=1))
+    assert fingerprint(DataRecipe()) == fingerprint(DataRecipe())
+
+
+def test_image_loss_is_zero_for_the_truth_and_counts_edges():
+    target = torch.zeros(1, 4, 4)
+    offset, stripes = torch.full((1, 4, 4), 0.1), 0.1 * (torch.arange(4) % 2 * 2.0 - 1).expand(1, 4, 4)
+    assert loop.image_loss(target, target, 0.5).item() == 0.0
+    assert loop.image_loss(target + offset, target, 0.5).item() == pytest.approx(0.1)
+    assert loop.image_loss(target + stripes, target, 0.5).item() == pytest.approx(0.1 + 0.5 * 0.2)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 10**6))
+def test_no_point_of_the_image_moves_faster_than_the_path_says(seed: int):
+    rng = np.random.default_rng(seed)
+    scene = training_scene(rng, 48, 6)
+    travelled = np.linspace(0.0, float(scene.travelled[-1]), 300)
+    homographies = scene.path.homographies(travelled)
+    x, y = (values.ravel() for values in np.meshgrid(np.linspace(0, 47, 7), np.linspace(0, 47, 7)))
+    pixels = np.stack([x, y], axis=-1)
+    texels = apply_homography(np.linalg.inv(homographies[:-1]), pixels)
+    moved = np.linalg.norm(apply_homography(homographies[1:], texels) - pixels, axis=-1).max(axis=1)
+    step = travelled[1] - travelled[0]
+    assert moved.max() <= 1.1 * step + 1e-6
+    assert step < 1e-9 or moved.mean() > 0.5 * step
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 10**6), st.floats(0.5, 25.0))
+def test_speed_profile_keeps_to_its_top_speed_and_never_turns_back(seed: int, top_speed: float):
+    travelled = speed_profile(np.random.default_rng(seed), 12, top_speed)
+    steps = np.diff(travelled) * 16
+    assert len(travelled) == 12 * 16 + 1
+    assert (steps >= 0).all()
+    assert steps.max() <= top_speed * (1 + 1e-9)
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.integers(0, 10**6))
+def test_windows_hold_their_own_events_and_a_target_between_black_and_white(seed: int):
+    scene = training_scene(np.random.default_rng(seed), 40, 5)
+    sequence = list(windows(scene, seed))
+    assert len(sequence) == 5
+    for index, window in enumerate(sequence):
+        assert window.target.shape == (40, 40)
+        assert window.target.min() >= BLACK - 1e-6
+        assert window.target.max() <= WHITE + 1e-6
+        if len(window.t_us):
+            assert window.t_us.min() >= index * window.duration_us - 1
+            assert window.t_us.max() <= (index + 1) * window.duration_us + 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rendered_corners_lie_where_the_homography_says(seed: int):
+    """The truth that the evaluation measures against is that of the pictures, to a few hundredths of a pixel."""
+    scene = evaluation_scene(np.random.default_rng(seed), 2, top_speed=6.0)
+    window = list(windows(scene, seed))[-1]
+    image = np.round(255 * window.target).astype(np.uint8)
+    start = window.corners.astype(np.float32).reshape(-1, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
+    found = np.asarray(cv2.cornerSubPix(image, start, (5, 5), (-1, -1), criteria)).reshape(-1, 2)
+    assert np.sqrt(((found - window.corners) ** 2).sum(axis=1).mean()) < 0.06
+    assert np.abs((found - window.corners).mean(axis=0)).max() < 0.02
+
+
+def test_find_corners_says_when_there_is_no_board():
+    assert find_corners(np.full((60, 80), 128, dtype=np.uint8), (9, 6)) is None
+
+
+def test_corner_errors_measure_latency_and_bias():
+    rng = np.random.default_rng(0)
+    velocity = rng.normal(0, 300, (500, 2))
+    errors = CornerErrors(-2e-3 * velocity + rng.normal(0, 0.01, (500, 2)), velocity, np.full(500, 0.03), 10, 10)
+    assert errors.latency_s == pytest.approx(2e-3, rel=0.01)
+    assert errors.bias_px == pytest.approx(-2e-3 * np.linalg.norm(velocity, axis=1).mean(), rel=0.02)
+    assert errors.rms_px == pytest.approx(2e-3 * np.sqrt((velocity**2).sum(axis=1).mean()), rel=0.01)
+    fast = errors.moving(10.0, 1e9)
+    assert 0 < len(fast.errors) < 500
+    assert fast.rms_px > errors.rms_px

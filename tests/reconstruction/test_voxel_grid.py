@@ -1,0 +1,142 @@
+"""The voxel grid: conservation, symmetry, normalisation, and the windows that have too little in them."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxcal.errors import CalibrationError
+from reconstruction import voxel_grid
+from reconstruction.voxel import accumulate, normalise
+
+WIDTH, HEIGHT = 7, 5
+SIZE = {"width": WIDTH, "height": HEIGHT}
+
+
+@st.composite
+def events(draw: st.DrawFn, min_size: int = 0) -> tuple[np.ndarray, ...]:
+    """x, y, t_us, p of some events, in order of time."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    n = draw(st.integers(min_size, 60))
+    start = draw(st.sampled_from([0, 1_600_000_000_000_000]))
+    t = start + np.sort(rng.integers(0, draw(st.sampled_from([1, 40, 50_000])), n))
+    return (
+        rng.integers(0, WIDTH, n).astype(np.uint16),
+        rng.integers(0, HEIGHT, n).astype(np.uint16),
+        t.astype(np.int64),
+        rng.random(n) < 0.5,
+    )
+
+
+@settings(deadline=None, max_examples=60)
+@given(events(), st.integers(1, 6))
+def test_sum_per_pixel_is_rises_minus_falls(window: tuple[np.ndarray, ...], bins: int):
+    x, y, _, p = window
+    expected = np.zeros((HEIGHT, WIDTH))
+    np.add.at(expected, (y.astype(int), x.astype(int)), np.where(p, 1.0, -1.0))
+    np.testing.assert_allclose(accumulate(*window, **SIZE, num_bins=bins).sum(axis=0), expected, atol=1e-4)
+
+
+@settings(deadline=None, max_examples=60)
+@given(events(), st.integers(0, 2**32 - 1))
+def test_order_of_events_does_not_matter(window: tuple[np.ndarray, ...], seed: int):
+    order = np.random.default_rng(seed).permutation(len(window[0]))
+    shuffled = tuple(values[order] for values in window)
+    np.testing.assert_allclose(accumulate(*shuffled, **SIZE), accumulate(*window, **SIZE), atol=1e-5)
+
+
+@settings(deadline=None, max_examples=60)
+@given(events(min_size=1), st.integers(1, 59))
+def test_grids_of_parts_add_up_when_they_span_the_same_time(window: tuple[np.ndarray, ...], cut: int):
+    """Linear before normalisation: each part is completed by the first and last event, which then count twice."""
+    x, y, t, p = window
+    ends = np.array([0, len(t) - 1])
+    inner = np.arange(1, len(t) - 1)
+    first, second = inner[inner < cut], inner[inner >= cut]
+
+    def grid(rows: np.ndarray) -> np.ndarray:
+        return accumulate(*(values[rows] for values in (x, y, t, p)), **SIZE)
+
+    completed = [grid(np.concatenate([ends[:1], part, ends[1:]])) for part in (first, second)]
+    whole = grid(np.concatenate([ends[:1], inner, ends[1:]]))
+    np.testing.assert_allclose(completed[0] + completed[1] - grid(ends), whole, atol=1e-5)
+
+
+@settings(deadline=None, max_examples=60)
+@given(events())
+def test_opposite_polarity_gives_the_opposite_grid(window: tuple[np.ndarray, ...]):
+    x, y, t, p = window
+    np.testing.assert_allclose(accumulate(x, y, t, ~p, **SIZE), -accumulate(x, y, t, p, **SIZE), atol=1e-6)
+
+
+@settings(deadline=None, max_examples=60)
+@given(events(), st.sampled_from([1e-3, 1.0, 60.0]), st.integers(-(10**6), 10**6))
+def test_time_counts_only_relative_to_first_and_last_event(window: tuple[np.ndarray, ...], scale: float, shift: int):
+    x, y, t, p = window
+    moved = (t - (t[0] if len(t) else 0)) * scale + shift
+    np.testing.assert_allclose(accumulate(x, y, moved, p, **SIZE), accumulate(x, y, t, p, **SIZE), atol=1e-4)
+
+
+@settings(deadline=None, max_examples=60)
+@given(events(min_size=2))
+def test_non_zero_cells_are_normalised(window: tuple[np.ndarray, ...]):
+    raw, grid = accumulate(*window, **SIZE), voxel_grid(*window, **SIZE)
+    assert grid.dtype == np.float32
+    assert grid.shape == (5, HEIGHT, WIDTH)
+    assert np.isfinite(grid).all()
+    assert (grid[raw == 0] == 0).all()
+    filled = raw[raw != 0].astype(np.float64)
+    if len(filled) and filled.std() > 1e-3:
+        values = grid[raw != 0].astype(np.float64)
+        np.testing.assert_allclose([values.mean(), values.std()], [0.0, 1.0], atol=1e-5)
+        np.testing.assert_allclose(values, (filled - filled.mean()) / filled.std(), atol=1e-4)
+
+
+def test_an_event_is_shared_by_the_two_bins_around_it():
+    grid = accumulate(
+        np.array([0, 3, 6]), np.array([0, 2, 4]), np.array([100, 130, 200]), np.array([1, 1, 0]), **SIZE, num_bins=5
+    )
+    expected = np.zeros((5, HEIGHT, WIDTH))
+    expected[0, 0, 0] = 1.0
+    expected[1, 2, 3], expected[2, 2, 3] = 0.8, 0.2  # 30 of 100 us lie at bin 1.2 of 0..4
+    expected[4, 4, 6] = -1.0
+    np.testing.assert_allclose(grid, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("polarity", [[True, False], [1, 0], [1, -1]])
+def test_polarity_may_be_written_in_any_of_the_usual_ways(polarity: list[int]):
+    grid = accumulate(np.array([1, 2]), np.array([0, 0]), np.array([0, 9]), np.array(polarity), **SIZE)
+    assert grid[0, 0, 1] == 1.0
+    assert grid[4, 0, 2] == -1.0
+
+
+def test_no_events_give_zeros():
+    nothing = np.zeros(0, dtype=np.int64)
+    grid = voxel_grid(nothing, nothing, nothing, nothing, **SIZE)
+    assert grid.shape == (5, HEIGHT, WIDTH)
+    assert (grid == 0).all()
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_events_at_one_time_lie_in_the_first_bin(count: int):
+    same = np.full(count, 4)
+    grid = voxel_grid(same, same, np.full(count, 5_000), np.ones(count), **SIZE)
+    assert np.isfinite(grid).all()
+    assert np.argwhere(grid).tolist() == [[0, 4, 4]]
+
+
+def test_normalisation_of_equal_cells_leaves_them():
+    grid = np.zeros((5, HEIGHT, WIDTH), dtype=np.float32)
+    grid[2, 1, 1:4] = 2.0
+    np.testing.assert_array_equal(normalise(grid), grid)
+
+
+@pytest.mark.parametrize(("x", "y"), [(WIDTH, 0), (0, HEIGHT), (-1, 0)])
+def test_event_outside_the_sensor_is_refused(x: int, y: int):
+    with pytest.raises(CalibrationError, match=rf"event 1 at \(x, y\) = \({x}, {y}\).*7x5"):
+        voxel_grid(np.array([0, x]), np.array([0, y]), np.array([0, 1]), np.array([1, 1]), **SIZE)
+
+
+def test_arrays_of_different_lengths_are_refused():
+    with pytest.raises(CalibrationError, match="2, 2, 2, 1 entries"):
+        voxel_grid(np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(1), **SIZE)
