@@ -40,6 +40,11 @@ class ImageFiles:
             )
         return image
 
+    def fingerprint(self) -> str:
+        """A text that changes when any of the files does: names, sizes and times of modification."""
+        facts = [(path.name, path.stat()) for path in self.paths]
+        return "\n".join(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in facts)
+
 
 def read_grey(path: Path) -> np.ndarray:
     """A grey uint8 image (H, W) from a file, as stored (a camera's rotation tag is ignored: pixels are what counts).

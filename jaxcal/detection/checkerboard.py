@@ -1,0 +1,102 @@
+"""Checkerboard corners in one image: find the board, number its corners the same way every time, refine them."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from jaxcal.detection.outliers import agreeing_corners
+from jaxcal.detection.refine import refine_corners
+from jaxcal.targets import Checkerboard
+
+# CALIB_CB_ACCURACY doubles the time and is undone by the refinement; CALIB_CB_EXHAUSTIVE takes a second for an image
+# without a board and found no board more, in real images and in noise of 30 grey levels.
+_FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE
+_MAX_HALF_WINDOW = 10
+_REACH = 0.4  # of the distance to the nearest corner
+
+
+def find_checkerboard(image: np.ndarray, target: Checkerboard) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the board in a grey uint8 image: (K,) indices into `target.points`, (K, 2) pixels; K may be 0.
+
+    The board is found as a whole or not at all (`cv2.findChessboardCornersSB`: Duda & Frese 2018); each corner is then
+    refined on the original image, and single ones that refinement or their neighbours contradict are left out.
+
+    Numbering: as seen on the board, row by row from the lower left, never mirrored. Where the board's two ends differ
+    in colour (rows + cols odd), "lower left" is where the outer square is black, so that a corner has one number in
+    all cameras and at any roll. Other boards look the same upside down: of the two numberings, the one nearest to
+    upright in the image is taken, and cameras must not be rolled by 90 degrees or more against each other.
+    """
+    grid = _find(image, target)
+    if grid is None:
+        return np.empty(0, np.int64), np.empty((0, 2))
+    grid = _canonical(image, grid)
+    corners = grid.reshape(-1, 2)
+    refined, trusted = refine_corners(image, corners, _half_windows(grid).ravel())
+    point = np.flatnonzero(trusted)
+    keep = agreeing_corners(target.points[point, :2], refined[point])
+    return point[keep], refined[point[keep]]
+
+
+def _find(image: np.ndarray, target: Checkerboard) -> np.ndarray | None:
+    """The board's corners as a grid (rows, cols, 2), in any orientation; None where there is no board."""
+    for prepared, scale in _attempts(image):
+        found, corners = cv2.findChessboardCornersSB(prepared, (target.cols, target.rows), flags=_FLAGS)
+        if found:
+            pixels = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
+            return pixels.reshape(target.rows, target.cols, 2)
+    return None
+
+
+def _attempts(image: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
+    """(prepared image, its scale), the most fruitful first."""
+    yield image, 1.0
+    yield cv2.createCLAHE(clipLimit=4.0, tileGridSize=(4, 4)).apply(cv2.GaussianBlur(image, (0, 0), 1.5)), 1.0
+
+
+def _canonical(image: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """The same grid, numbered from the lower left as `find_checkerboard` says."""
+    rows, cols, _ = grid.shape
+    turned = [grid, grid.transpose(1, 0, 2)] if rows == cols else [grid]
+    variants = [variant[::up, ::right] for variant in turned for up in (1, -1) for right in (1, -1)]
+    seen_from_front = [variant for variant in variants if _handedness(variant) < 0.0]
+    return max(seen_from_front, key=lambda variant: (_lower_left_is_black(image, variant), _uprightness(variant)))
+
+
+def _handedness(grid: np.ndarray) -> float:
+    """Sign of the turn from columns to rows in the image, whose v axis points down: negative seen from the front."""
+    along, up = _mean_directions(grid)
+    return float(along[0] * up[1] - along[1] * up[0])
+
+
+def _uprightness(grid: np.ndarray) -> float:
+    """How far columns run to the right and rows upwards in the image: 2 when upright, -2 upside down."""
+    along, up = _mean_directions(grid)
+    return float(along[0] / np.linalg.norm(along) - up[1] / np.linalg.norm(up))
+
+
+def _mean_directions(grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.diff(grid, axis=1).mean(axis=(0, 1)), np.diff(grid, axis=0).mean(axis=(0, 1))
+
+
+def _lower_left_is_black(image: np.ndarray, grid: np.ndarray) -> bool:
+    """Whether the square outside the first corner is black: all squares between the corners are asked."""
+    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4.0
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.5)
+    u, v = np.moveaxis(centres.astype(np.float32), -1, 0)
+    grey = cv2.remap(smooth, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
+    # The square between the first four corners touches the outer one at a corner, so it has the same colour.
+    same = np.indices(grey.shape).sum(axis=0) % 2 == 0
+    return bool(grey[same].mean() < grey[~same].mean())
+
+
+def _half_windows(grid: np.ndarray) -> np.ndarray:
+    """Half-width (rows, cols) of the refinement windows: well short of the nearest neighbour."""
+    nearest = np.full(grid.shape[:2], np.inf)
+    along = np.linalg.norm(np.diff(grid, axis=1), axis=2)
+    up = np.linalg.norm(np.diff(grid, axis=0), axis=2)
+    nearest[:, 1:] = np.minimum(nearest[:, 1:], along)
+    nearest[:, :-1] = np.minimum(nearest[:, :-1], along)
+    nearest[1:] = np.minimum(nearest[1:], up)
+    nearest[:-1] = np.minimum(nearest[:-1], up)
+    return np.clip(np.floor(nearest * _REACH), 2, _MAX_HALF_WINDOW).astype(np.int64)
