@@ -1,7 +1,7 @@
 """Event recordings in e2calib's HDF5 layout, read lazily in windows of time."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import h5py
@@ -73,13 +73,20 @@ class EventFile:
         if window_ns <= 0:
             raise CalibrationError(f"{self.path}: windows of {window_ns} ns; expected a positive length.")
         start = self.first_ns if start_ns is None else int(start_ns)
-        low = 0 if start_ns is None else self._first_at_or_after(start)
-        while start <= self.last_ns:
-            end = start + int(window_ns)
-            high = self._first_at_or_after(end)
+        yield from self.windows_ending(range(start + window_ns, self.last_ns + window_ns + 1, window_ns), start)
+
+    def windows_ending(self, ends_ns: Iterable[int], start_ns: int | None = None) -> Iterator[tuple[int, Events]]:
+        """Consecutive windows that end (exclusively) at the given increasing times, as (end, events).
+
+        The first one starts at `start_ns`, by default at the first event.
+        """
+        start = self.first_ns if start_ns is None else int(start_ns)
+        low = 0 if start_ns is None or start <= self.first_ns else self._first_at_or_after(start)
+        for end in ends_ns:
+            high = max(low, self._first_at_or_after(end))
             yield end, self._slice(low, high, start, end)
             start, low = end, high
-        if low != self._length:
+        if start > self.last_ns and low != self._length:
             raise self._unsorted(low)
 
     def _slice(self, low: int, high: int, t0_ns: int, t1_ns: int) -> Events:
