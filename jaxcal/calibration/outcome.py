@@ -73,4 +73,5 @@ def calibration_from(
         warnings=tuple(sentences),
         settings=dict(settings),
         versions=versions(),
+        converged=bool(fit.result.converged),
     )

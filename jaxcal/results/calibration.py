@@ -53,7 +53,8 @@ class ImuCalibration:
     All arrays are at the IMU samples used, at `t_s` (N,) seconds since `origin_ns`.
     `gyro_rad_s`, `accel_m_s2` (N, 3) measured; `gyro_predicted`, `accel_predicted` (N, 3) from the spline, biases
     included; `gyro_bias`, `accel_bias` (N, 3) the biases there, `gyro_bias_std`, `accel_bias_std` (N, 3) their 1-sigma
-    (or None); `gyro_sigma`, `accel_sigma` the discrete noise assumed, rad/s and m/s^2. `position_m` (N, 3) and
+    (or None); `gyro_sigma`, `accel_sigma` the discrete noise assumed, rad/s and m/s^2; `noise` the densities stated, by
+    the names of Kalibr's `imu.yaml`. `position_m` (N, 3) and
     `rotation` (N, 3, 3) are the IMU's pose in the target frame (T_target_imu).
     """
 
@@ -86,8 +87,8 @@ class Calibration:
     'cam0.timeshift_cam_imu' (s), 'gravity' (m/s^2, target frame). Held parameters have zero variance.
 
     `gravity` (3,) is the acceleration of free fall in the target frame (it points down), None without an IMU.
-    `convergence` is the cost after each iteration of the last solve; `warnings` are sentences for a person;
-    `settings` and `versions` say how to get this result again.
+    `convergence` is the cost after each iteration of the last solve, `converged` whether that solve reached its
+    tolerance; `warnings` are sentences for a person; `settings` and `versions` say how to get this result again.
     """
 
     cameras: tuple[CameraCalibration, ...]
@@ -100,6 +101,7 @@ class Calibration:
     warnings: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
+    converged: bool = True
 
     def _slice(self, name: str) -> slice:
         start = 0

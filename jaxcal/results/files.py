@@ -9,10 +9,10 @@ A folder holds, each written atomically:
 
 `calibration.npz`, version 1, holds no pickles. `meta` is the UTF-8 of a JSON object (as uint8): `format`, `version`,
 `cameras` (per camera `name`, `model`, `image_size`, `timeshift_cam_imu`, `corner_sigma_px`), `target` (as in Kalibr's
-`target.yaml`), `blocks`, `warnings`, `settings`, `versions`, and `imu` (the scalars of `ImuCalibration`) or null. The
-arrays are `covariance`, `convergence`, `gravity`; for camera k `cam<k>.parameters`, `.T_cn_cnm1`, `.T_cam_imu`,
-`.residuals_px`, `.inlier` and `.detections.timestamps_ns`, `.frame`, `.point`, `.pixels`, `.image_size`; and
-`imu.<field>` for every array of `ImuCalibration`. What is None is absent.
+`target.yaml`), `blocks`, `converged`, `warnings`, `settings`, `versions`, and `imu` (the scalars of `ImuCalibration`)
+or null. The arrays are `covariance`, `convergence`, `gravity`; for camera k `cam<k>.parameters`, `.T_cn_cnm1`,
+`.T_cam_imu`, `.residuals_px`, `.inlier` and `.detections.timestamps_ns`, `.frame`, `.point`, `.pixels`,
+`.image_size`; and `imu.<field>` for every array of `ImuCalibration`. What is None is absent.
 """
 
 import dataclasses
@@ -127,6 +127,7 @@ def _meta(calibration: Calibration) -> dict[str, Any]:
         "target": calibration.target.to_yaml(),
         "imu": None if imu is None else {name: _plain_mapping(getattr(imu, name)) for name in _IMU_SCALARS},
         "blocks": [[name, size] for name, size in calibration.blocks],
+        "converged": calibration.converged,
         "warnings": list(calibration.warnings),
         "settings": _plain_mapping(calibration.settings),
         "versions": _plain_mapping(calibration.versions),
@@ -211,6 +212,7 @@ def _decode(meta: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         warnings=tuple(meta["warnings"]),
         settings=meta["settings"],
         versions=meta["versions"],
+        converged=meta["converged"],
     )
 
 

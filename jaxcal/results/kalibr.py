@@ -68,10 +68,10 @@ def imu_entry(imu: ImuCalibration) -> dict[str, Any]:
         rate = 1.0 / float(np.median(np.diff(imu.t_s)))
     entry = {
         "T_i_b": np.eye(4).tolist(),
-        "accelerometer_noise_density": float(imu.noise["accel_noise_density"]),
-        "accelerometer_random_walk": float(imu.noise["accel_random_walk"]),
-        "gyroscope_noise_density": float(imu.noise["gyro_noise_density"]),
-        "gyroscope_random_walk": float(imu.noise["gyro_random_walk"]),
+        "accelerometer_noise_density": float(imu.noise["accelerometer_noise_density"]),
+        "accelerometer_random_walk": float(imu.noise["accelerometer_random_walk"]),
+        "gyroscope_noise_density": float(imu.noise["gyroscope_noise_density"]),
+        "gyroscope_random_walk": float(imu.noise["gyroscope_random_walk"]),
         "model": "calibrated",
         "rostopic": "/imu0",
         "time_offset": 0.0,

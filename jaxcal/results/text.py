@@ -149,13 +149,13 @@ def _imu_configuration(imu: ImuCalibration) -> str:
             "  Model: calibrated",
             f"  Update rate: {rate:.6g}",
             "  Accelerometer:",
-            f"    Noise density: {imu.noise['accel_noise_density']}",
+            f"    Noise density: {imu.noise['accelerometer_noise_density']}",
             f"    Noise density (discrete): {imu.accel_sigma}",
-            f"    Random walk: {imu.noise['accel_random_walk']}",
+            f"    Random walk: {imu.noise['accelerometer_random_walk']}",
             "  Gyroscope:",
-            f"    Noise density: {imu.noise['gyro_noise_density']}",
+            f"    Noise density: {imu.noise['gyroscope_noise_density']}",
             f"    Noise density (discrete): {imu.gyro_sigma}",
-            f"    Random walk: {imu.noise['gyro_random_walk']}",
+            f"    Random walk: {imu.noise['gyroscope_random_walk']}",
             f"  Spline: order {imu.spline_order}, {imu.knot_rate_hz:g} knots per second",
         ]
     )

@@ -40,6 +40,12 @@ class Check:
     problem: str
     remedy: str
 
+    @property
+    def sentence(self) -> str:
+        """The problem as a sentence; names of cameras keep their spelling."""
+        text = self.problem if self.problem.startswith(self.subject) else self.problem[:1].upper() + self.problem[1:]
+        return f"{text}."
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -95,7 +101,7 @@ def _below(value: float, limits: tuple[float, float]) -> Level:
 
 
 def _checks(calibration: Calibration) -> Iterator[Check]:
-    yield from _numbers_finite(calibration)
+    yield from _solution_checks(calibration)
     for index, camera in enumerate(calibration.cameras):
         yield from _residual_checks(camera)
         yield from _view_checks(camera)
@@ -107,7 +113,16 @@ def _checks(calibration: Calibration) -> Iterator[Check]:
     yield from _gravity_checks(calibration)
 
 
-def _numbers_finite(calibration: Calibration) -> Iterator[Check]:
+def _solution_checks(calibration: Calibration) -> Iterator[Check]:
+    yield Check(
+        "solution",
+        "convergence",
+        "converged" if calibration.converged else "stopped early",
+        "converged",
+        "good" if calibration.converged else "bad",
+        "the optimisation stopped before it converged",
+        "Allow more steps; if it still does not settle, the recording leaves parameters undetermined.",
+    )
     parameters = np.concatenate([np.asarray(camera.model.parameters) for camera in calibration.cameras])
     finite = bool(np.isfinite(parameters).all() and np.isfinite(calibration.covariance).all())
     yield Check(
@@ -290,6 +305,6 @@ def _gravity_checks(calibration: Calibration) -> Iterator[Check]:
         f"{size:.3f} m/s²",
         f"9.81 within {_GRAVITY_M_S2[0]:g}",
         _above(abs(size - 9.81), _GRAVITY_M_S2),
-        f"gravity comes out as {size:.2f} m/s²",
+        f"the size of gravity comes out as {size:.2f} m/s²",
         "Check the accelerometer's units and the size of the target.",
     )

@@ -271,7 +271,7 @@ def test_images_are_found_by_their_time() -> None:
     grey = []
     for picture in shown:
         data = np.frombuffer(base64.b64decode(picture.jpeg_base64), np.uint8)
-        grey.append(int(np.median(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE))))
+        grey.append(int(np.median(np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)))))
     np.testing.assert_allclose(grey, [20 * k for k in kept], atol=2)
 
 

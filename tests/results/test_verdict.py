@@ -63,6 +63,7 @@ DEFECTS: dict[str, tuple[Callable[[float], Calibration], float, float, str]] = {
     "gyroscope bias": (lambda f: with_imu(gyro_bias=np.full((3, 3), f)), 0.5, 2.0, "bias"),
     "accelerometer bias": (lambda f: with_imu(accel_bias=np.full((3, 3), -f)), 3.0, 8.0, "bias"),
     "size": (lambda f: dataclasses.replace(GOOD, gravity=np.array([0.0, -f, 0.0])), 9.6, 8.0, "gravity"),
+    "convergence": (lambda f: dataclasses.replace(GOOD, converged=False), 1, 1, "before it converged"),
     "numbers": (lambda f: dataclasses.replace(GOOD, covariance=np.full_like(GOOD.covariance, np.nan)), 1, 1, "finite"),
 }  # fmt: skip
 
@@ -87,7 +88,7 @@ def shifted(pixels: float) -> Any:
     return MODEL.with_parameters(parameters.at[2].add(pixels))
 
 
-@pytest.mark.parametrize("title", sorted(set(DEFECTS) - {"principal point", "numbers"}))
+@pytest.mark.parametrize("title", sorted(set(DEFECTS) - {"principal point", "numbers", "convergence"}))
 def test_each_defect_weakens_and_then_spoils_the_result(title: str) -> None:
     make, weak, spoilt, word = DEFECTS[title]
     verdict = judge(make(weak))
@@ -102,7 +103,7 @@ def test_each_defect_weakens_and_then_spoils_the_result(title: str) -> None:
     assert any(word in check.problem for check in worst)
 
 
-@pytest.mark.parametrize("title", ["principal point", "numbers"])
+@pytest.mark.parametrize("title", ["principal point", "numbers", "convergence"])
 def test_some_defects_leave_no_middle(title: str) -> None:
     make, size, _, word = DEFECTS[title]
     verdict = judge(make(size))
@@ -125,6 +126,8 @@ def test_the_worst_finding_comes_first() -> None:
     verdict = judge(both)
     assert [check.level for check in verdict.failed] == ["bad", "usable"]
     assert "gravity comes out as 3.00" in verdict.headline
+    assert verdict.failed[0].sentence == "The size of gravity comes out as 3.00 m/s²."
+    assert verdict.failed[1].sentence.startswith("cam0's time offset")
     assert "1 more finding" in verdict.headline
 
 

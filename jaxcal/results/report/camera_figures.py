@@ -57,6 +57,11 @@ def _corner_sigma(camera: CameraCalibration) -> float:
     return camera.corner_sigma_px if np.isfinite(camera.corner_sigma_px) else 0.0
 
 
+def _faintness(count: int) -> float:
+    """Opacity of one point among `count`, so that a dense cloud still shows where it is densest."""
+    return float(np.clip(8000.0 / max(count, 1), 0.08, 0.6))
+
+
 def _coverage_picture(camera: CameraCalibration, prefix: str) -> Picture:
     figure, axes = image_panel(camera.image_size)
     counts = corner_counts(camera)
@@ -66,7 +71,7 @@ def _coverage_picture(camera: CameraCalibration, prefix: str) -> Picture:
         corner = (col * width / across - 0.5, row * height / down - 0.5)
         axes.add_patch(Rectangle(corner, width / across, height / down, facecolor=WARN, edgecolor="none", alpha=0.22))
     x, y = camera.detections.pixels[camera.used].T
-    axes.plot(x, y, ".", markersize=1.6, color=POINT, alpha=0.7, rasterized=True)
+    axes.plot(x, y, ".", markersize=1.6, color=POINT, alpha=_faintness(2 * len(x)), rasterized=True)
     return Picture(
         "Coverage",
         to_svg(figure, prefix),
@@ -82,8 +87,7 @@ def _scatter_picture(camera: CameraCalibration, prefix: str) -> Picture:
     sigma = _corner_sigma(camera)
     used, rejected = camera.residuals_px[camera.used], _rejected(camera)
     limit = 5.0 * sigma if sigma > 0 else 1.0
-    faint = float(np.clip(4000.0 / max(len(used), 1), 0.08, 0.5))  # so that a dense cloud still shows its core
-    axes.plot(*used.T, ".", markersize=1.8, color=POINT, alpha=faint, rasterized=True)
+    axes.plot(*used.T, ".", markersize=1.8, color=POINT, alpha=_faintness(len(used)), rasterized=True)
     axes.plot(*rejected.T, "x", markersize=3.0, color=REJECTED, alpha=0.8, rasterized=True)
     for factor, style in ((1.0, "-"), (3.0, "--")):
         axes.add_patch(

@@ -51,10 +51,10 @@ def panel(rows: int = 1, size: tuple[float, float] = PANEL) -> tuple[Figure, Seq
     figure = Figure(figsize=size)
     grid = figure.subplots(rows, 1, sharex=True, squeeze=False, gridspec_kw={"hspace": 0.12})[:, 0]
     bottom = 0.145 * PANEL[1] / size[1]
-    figure.subplots_adjust(left=0.165, right=0.975, top=0.97, bottom=bottom)
+    figure.subplots_adjust(left=0.185, right=0.975, top=0.97, bottom=bottom)
     for axes in grid:
         _dress(axes)
-        axes.yaxis.set_label_coords(-0.165, 0.5)
+        axes.yaxis.set_label_coords(-0.19, 0.5)
     return figure, list(grid)
 
 

@@ -44,11 +44,11 @@ def imu_pictures(imu: ImuCalibration, prefix: str) -> list[Picture]:
     """The motion and the residuals of gyroscope and accelerometer, then their biases and their fit over time."""
     gyro = _Sensor(
         "Gyroscope", "rad/s", imu.gyro_rad_s, imu.gyro_predicted, imu.gyro_sigma, imu.gyro_bias, imu.gyro_bias_std,
-        imu.noise.get("gyro_random_walk"),
+        imu.noise.get("gyroscope_random_walk"),
     )  # fmt: skip
     accel = _Sensor(
         "Accelerometer", "m/s²", imu.accel_m_s2, imu.accel_predicted, imu.accel_sigma, imu.accel_bias,
-        imu.accel_bias_std, imu.noise.get("accel_random_walk"),
+        imu.accel_bias_std, imu.noise.get("accelerometer_random_walk"),
     )  # fmt: skip
     zoom = _liveliest(imu)
     pictures = []

@@ -97,16 +97,16 @@ def _draw_rig(
         for axis, colour in enumerate(AXIS_COLOURS):
             line = np.stack([centre, centre + 0.8 * size * T_cam0_imu[:3, axis]])
             axes.plot(*(line @ view.T).T, color=colour, linewidth=1.8)
-        _name(axes, "imu0", centre @ view.T)
+        _name(axes, "imu0", centre @ view.T, above=True)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.12)
 
 
-def _name(axes: Axes, text: str, at: np.ndarray) -> None:
+def _name(axes: Axes, text: str, at: np.ndarray, above: bool = False) -> None:
     axes.annotate(
         text,
         (float(at[0]), float(at[1])),
-        (0, -14),
+        (0, 9 if above else -14),
         textcoords="offset points",
         ha="center",
         fontsize=8.5,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxcal.cameras import model_name
-from jaxcal.results.calibration import Calibration
+from jaxcal.results.calibration import Calibration, ImuCalibration
 from jaxcal.results.coverage import coverage
 from jaxcal.results.parameters import (
     Estimate,
@@ -109,9 +109,15 @@ def imu_facts(calibration: Calibration) -> tuple[tuple[str, str], ...]:
         ("duration", f"{imu.t_s[-1] - imu.t_s[0]:.2f} s"),
         ("rate", f"{1.0 / float(np.median(np.diff(imu.t_s))):.1f} Hz"),
         ("spline", f"order {imu.spline_order}, {imu.knot_rate_hz:g} knots/s"),
-        ("gyro noise", f"{imu.gyro_sigma:.3g} rad/s per sample"),
-        ("accel noise", f"{imu.accel_sigma:.3g} m/s² per sample"),
+        ("gyro noise", f"{imu.gyro_sigma:.3g} rad/s per sample, {_raised(imu, 'gyroscope', imu.gyro_sigma)}"),
+        ("accel noise", f"{imu.accel_sigma:.3g} m/s² per sample, {_raised(imu, 'accelerometer', imu.accel_sigma)}"),
     )
+
+
+def _raised(imu: ImuCalibration, sensor: str, assumed: float) -> str:
+    """How the noise assumed compares with the density stated, which the calibration may have raised to fit."""
+    stated = imu.noise[f"{sensor}_noise_density"] * np.sqrt(1.0 / float(np.median(np.diff(imu.t_s))))
+    return f"{assumed / stated:.2g} times the stated"
 
 
 def _pose_tables(calibration: Calibration, index: int) -> tuple[Table, ...]:
