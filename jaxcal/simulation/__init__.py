@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 # Loaded when first asked for: the event sensor alone must not pull in the renderer.
 _EXPORTS = {
+    "Imaging": "rig",
     "Motion": "motion",
     "SimulatedCamera": "rig",
     "SimulatedRig": "rig",
@@ -20,6 +21,7 @@ _EXPORTS = {
 __all__ = [
     "EventSensor",
     "EventSensorConfig",
+    "Imaging",
     "Motion",
     "SimulatedCamera",
     "SimulatedRig",
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
     from jaxcal.simulation.measurements import simulate_detections, simulate_imu
     from jaxcal.simulation.motion import Motion
     from jaxcal.simulation.recordings import write_recording
-    from jaxcal.simulation.rig import SimulatedCamera, SimulatedRig, paper_rig, swinging_motion
+    from jaxcal.simulation.rig import Imaging, SimulatedCamera, SimulatedRig, paper_rig, swinging_motion
 
 
 def __getattr__(name: str) -> Any:

@@ -16,7 +16,9 @@ _PIXEL_VARIANCE = 1.0 / 12.0
 # Gauss-Hermite nodes for a standard normal.
 _NODES = ((-np.sqrt(3.0), 1.0 / 6.0), (0.0, 2.0 / 3.0), (np.sqrt(3.0), 1.0 / 6.0))
 _FAR = 1e6  # metres; where the background ends
-_BEHIND = 1e-6  # 1 / metres; inverse depth below which a ray misses the plane
+_HORIZON_PX = 5.0
+_COARSE_PX = 8
+_NEWTON_STEPS = 3
 
 
 class PixelRays(NamedTuple):
@@ -70,25 +72,41 @@ def _lines(inner: np.ndarray) -> Lines:
 
 
 def pixel_rays(model: CameraModel, image_size: tuple[int, int]) -> PixelRays:
-    """Rays of all pixels of a camera, row by row. Pixels outside the lens' domain look backwards, so see background."""
+    """Rays of all pixels of a camera, row by row. Pixels outside the lens' domain look backwards, so see background.
+
+    The model's own unprojection serves a coarse grid; rays interpolated from it are refined by Newton's method.
+    """
     width, height = image_size
     v, u = np.mgrid[:height, :width]
-    pixels = jnp.asarray(np.stack([u, v], axis=-1).reshape(-1, 2), dtype=jnp.float64)
-    return _pixel_rays(model, pixels)
+    nodes = _COARSE_PX * np.stack(np.meshgrid(np.arange(width // _COARSE_PX + 2), np.arange(height // _COARSE_PX + 2)))
+    coarse = np.asarray(model.unproject(jnp.asarray(np.moveaxis(nodes, 0, -1), dtype=jnp.float64)))
+    (i, down), (j, right) = np.divmod(v, _COARSE_PX), np.divmod(u, _COARSE_PX)
+    down, right = down[..., None] / _COARSE_PX, right[..., None] / _COARSE_PX
+    upper = (1.0 - right) * coarse[i, j] + right * coarse[i, j + 1]
+    lower = (1.0 - right) * coarse[i + 1, j] + right * coarse[i + 1, j + 1]
+    start = ((1.0 - down) * upper + down * lower).reshape(-1, 3)
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64)
+    return _refine_rays(model, jnp.asarray(pixels), jnp.asarray(start))
 
 
 @eqx.filter_jit
-def _pixel_rays(model: CameraModel, pixels: Float[Array, "n 2"]) -> PixelRays:
-    rays = model.unproject(pixels)
-    found = jnp.linalg.norm(model.project(rays) - pixels, axis=-1) < 1e-4
-    valid = found & jax.vmap(model.is_valid)(rays)
-
+def _refine_rays(model: CameraModel, pixels: Float[Array, "n 2"], start: Float[Array, "n 3"]) -> PixelRays:
     def inverse(ray: Float[Array, "3"]) -> Float[Array, "3 2"]:
-        jacobian = jax.jacfwd(model.project)(ray)  # (2, 3); the ray itself is its null space
-        return jacobian.T @ jnp.linalg.inv(jacobian @ jacobian.T)
+        """Change of the ray per pixel: the least one, orthogonal to the ray, which the projection does not see."""
+        jacobian = jax.jacfwd(model.project)(ray)
+        gram = jacobian @ jacobian.T
+        adjugate = jnp.array([[gram[1, 1], -gram[0, 1]], [-gram[1, 0], gram[0, 0]]])
+        return jacobian.T @ adjugate / (gram[0, 0] * gram[1, 1] - gram[0, 1] * gram[1, 0])
 
-    rays = jnp.where(valid[:, None], rays, jnp.array([0.0, 0.0, -1.0]))
-    per_pixel = jnp.where(valid[:, None, None], jax.vmap(inverse)(rays), 1e-3)
+    def refined(pixel: Float[Array, "2"], ray: Float[Array, "3"]) -> tuple[Array, Array]:
+        for _ in range(_NEWTON_STEPS):
+            ray = ray - inverse(ray) @ (model.project(ray) - pixel)
+            ray = ray / jnp.linalg.norm(ray)
+        found = jnp.linalg.norm(model.project(ray) - pixel) < 1e-4
+        valid = found & model.is_valid(ray)
+        return jnp.where(valid, ray, jnp.array([0.0, 0.0, -1.0])), jnp.where(valid, inverse(ray), 1e-3)
+
+    rays, per_pixel = jax.vmap(refined)(pixels, start)
     return PixelRays(rays.T.astype(jnp.float32), jnp.moveaxis(per_pixel, 0, -1).astype(jnp.float32))
 
 
@@ -115,16 +133,17 @@ def _footprint(rays: PixelRays, matrix: Float32[Array, "3 3"], sigma_px: float |
         return [matrix[i, 0] * column[0] + matrix[i, 1] * column[1] + matrix[i, 2] * column[2] for i in range(3)]
 
     plane_x, plane_y, plane_w = transform(rays.ray)
-    ahead = plane_w > _BEHIND
-    depth = 1.0 / jnp.where(ahead, plane_w, 1.0)
-    # Rays that miss the plane see the background, far to the side.
-    x, y = jnp.where(ahead, plane_x * depth, 0.5 * _FAR), jnp.where(ahead, plane_y * depth, 0.5 * _FAR)
     (ux, uy, uw), (vx, vy, vw) = transform(rays.per_pixel[:, 0]), transform(rays.per_pixel[:, 1])
+    # Rays that miss the plane, or meet it near its horizon where a first order says nothing, see the background.
+    ahead = plane_w > _HORIZON_PX * jnp.sqrt(uw * uw + vw * vw)
+    depth = 1.0 / jnp.where(ahead, plane_w, 1.0)
+    x, y = jnp.where(ahead, plane_x * depth, 0.5 * _FAR), jnp.where(ahead, plane_y * depth, 0.5 * _FAR)
     xu, xv = (ux - x * uw) * depth, (vx - x * vw) * depth
     yu, yv = (uy - y * uw) * depth, (vy - y * vw) * depth
     length_x, length_y = jnp.sqrt(xu * xu + xv * xv) + 1e-12, jnp.sqrt(yu * yu + yv * yv) + 1e-12
     correlation = (xu * yu + xv * yv) / (length_x * length_y)
-    return _Footprint(x, y, sigma_px * length_x, sigma_px * length_y, correlation)
+    sigma_x, sigma_y = (jnp.where(ahead, sigma_px * length, 1.0) for length in (length_x, length_y))
+    return _Footprint(x, y, sigma_x, sigma_y, jnp.where(ahead, correlation, 0.0))
 
 
 def _cell(lines: Lines, value: Array) -> tuple[Array, Array, Array]:

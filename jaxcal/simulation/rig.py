@@ -10,12 +10,16 @@ import numpy as np
 from jaxcal.cameras import CameraModel, PinholeRadtan, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import ImuNoise
+from jaxcal.simulation.event_sensor import EventSensorConfig
 from jaxcal.simulation.motion import Motion
 from jaxcal.targets import Checkerboard, Target
 
 CameraKind = Literal["events", "frames"]
 
 STANDARD_GRAVITY = 9.80665
+
+
+_SENSOR = EventSensorConfig(contrast_on=0.35, contrast_off=0.37)
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,24 @@ class SimulatedCamera:
 
 
 @dataclass(frozen=True)
+class Imaging:
+    """How images come about, for all cameras of a rig.
+
+    `psf_sigma_px`: the lens' Gaussian blur. Frame cameras integrate over `exposure_s` (timestamps are its middle),
+    drawn as `exposure_samples` sharp images, and add Gaussian noise of `grey_noise` grey levels. For event cameras
+    images are rendered so often that nothing moves further than `step_px` between two, at least every `step_s`.
+    """
+
+    psf_sigma_px: float = 0.6
+    exposure_s: float = 0.005
+    exposure_samples: int = 4
+    grey_noise: float = 1.5
+    step_px: float = 1.0
+    step_s: float = 0.01
+    event_sensor: EventSensorConfig = _SENSOR
+
+
+@dataclass(frozen=True)
 class SimulatedRig:
     """Cameras and an IMU, rigidly joined, that move in front of a target for `duration_s` seconds.
 
@@ -64,6 +86,7 @@ class SimulatedRig:
     duration_s: float
     seed: int = 0
     t0_ns: int = 1_600_000_000_000_000_000
+    imaging: Imaging = Imaging()
 
     def __post_init__(self) -> None:
         if not self.duration_s > 0:
@@ -88,6 +111,10 @@ class SimulatedRig:
     def motion_time(self, camera: SimulatedCamera, times_ns: np.ndarray) -> np.ndarray:
         """Seconds of the motion's time (IMU clock, since `t0_ns`) at camera-clock times (F,) ns."""
         return (times_ns - self.t0_ns) * 1e-9 + camera.timeshift_cam_imu
+
+    def camera_time_ns(self, camera: SimulatedCamera, motion_time_s: np.ndarray) -> np.ndarray:
+        """Camera-clock times (F,) int64 ns at seconds of the motion's time: the inverse of `motion_time`."""
+        return self.t0_ns + np.round((motion_time_s - camera.timeshift_cam_imu) * 1e9).astype(np.int64)
 
     def ground_truth(self) -> dict[str, Any]:
         """Everything a calibration estimates, as plain values ready for yaml."""
