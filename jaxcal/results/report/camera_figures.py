@@ -59,7 +59,7 @@ def _corner_sigma(camera: CameraCalibration) -> float:
 
 def _faintness(count: int) -> float:
     """Opacity of one point among `count`, so that a dense cloud still shows where it is densest."""
-    return float(np.clip(8000.0 / max(count, 1), 0.08, 0.6))
+    return float(np.clip(8000.0 / max(count, 1), 0.04, 0.6))
 
 
 def _coverage_picture(camera: CameraCalibration, prefix: str) -> Picture:

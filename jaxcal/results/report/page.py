@@ -7,6 +7,7 @@ from typing import Any
 
 import jinja2
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from jaxcal.observations import Frames
 from jaxcal.progress import Progress, no_progress
@@ -112,19 +113,24 @@ def _readable(mapping: Mapping[str, Any]) -> list[tuple[str, str]]:
 def _convergence_picture(calibration: Calibration, prefix: str) -> Picture:
     figure, (axes,) = panel()
     cost = np.asarray(calibration.convergence, dtype=np.float64)
-    shown = np.isfinite(cost) & (cost > 0)
-    if shown.any():
-        axes.semilogy(np.arange(len(cost))[shown], cost[shown], "o-", color=ACCENT, markersize=3.5, linewidth=1.1)
+    cost = cost[np.isfinite(cost)]
+    told, shown = "No cost was recorded.", np.zeros(0, dtype=bool)
+    if len(cost):
+        told = f"{len(cost) - 1} steps, from {cost[0]:.6g} to {cost[-1]:.6g}."
+        # Against the last cost, since the first is often almost as low: earlier solves have done the work.
+        above = (cost - cost.min()) / max(abs(cost.min()), np.finfo(np.float64).tiny)
+        shown = above > 0
+        axes.semilogy(np.arange(len(cost))[shown], above[shown], "o-", color=ACCENT, markersize=3.5, linewidth=1.1)
+        axes.set_xlim(-0.5, max(len(cost), 2) - 0.5)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(visible=False, which="minor")
-        told = f"{len(cost) - 1} steps, from {cost[shown][0]:.4g} to {cost[shown][-1]:.4g}."
-    else:
-        nothing_to_show(axes, "no cost recorded")
-        told = "No cost was recorded."
-    label(axes, "step", "cost")
+    if not shown.any():
+        nothing_to_show(axes, "nothing left to gain" if len(cost) else "no cost recorded")
+    label(axes, "step", "cost above the lowest, relative")
     return Picture(
         "Convergence",
         to_svg(figure, prefix),
         f"Cost after each step of the last solve: {told}",
-        "a fall that ends in a level stretch.",
-        "a curve that still falls at its end was stopped early; one that rises and falls met a poorly posed problem.",
+        "a fall by orders of magnitude to under a millionth.",
+        "a curve that ends high was stopped early; one that rises and falls met a poorly posed problem.",
     )
