@@ -1,5 +1,6 @@
 """The verdict: whether a calibration can be used, from checks that each state what was measured and what is wanted."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -65,7 +66,7 @@ def judge(calibration: Calibration) -> Verdict:
     """Check a calibration for what makes results unusable or weak. Warnings alone make it usable with care."""
     checks = tuple(_checks(calibration))
     failed = sorted((check for check in checks if check.level != "good"), key=lambda check: _severity(check.level))
-    problems = [check.problem for check in failed] + [warning.rstrip(".") for warning in calibration.warnings]
+    problems = [check.problem for check in failed] + [_clause(warning) for warning in calibration.warnings]
     if not problems:
         return Verdict("good", _praise(calibration, len(checks)), checks)
     level: Level = failed[0].level if failed else "usable"
@@ -73,6 +74,14 @@ def judge(calibration: Calibration) -> Verdict:
     others = len(problems) - 1
     rest = f", and {others} more finding{'s' if others > 1 else ''} below" if others else ""
     return Verdict(level, f"{opening} {problems[0]}{rest}.", checks)
+
+
+def _clause(warning: str) -> str:
+    """The start of a warning as a part of a longer sentence: its first statement, without the capital."""
+    statement = re.split(r"[.;] ", warning, maxsplit=1)[0].rstrip(".")
+    if statement[1:2].islower():  # not IMU, and not a name such as T_cam_imu
+        return statement[:1].lower() + statement[1:]
+    return statement
 
 
 def _severity(level: Level) -> int:

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -254,6 +256,11 @@ def test_parameters_survive_yaml_to_the_last_bit(tmp_path: Path) -> None:
     (read,) = load_camchain(tmp_path / "camchain-imucam.yaml")
     assert_same(read.model, lens)
     assert_same(read.T_cam_imu, made.cameras[0].T_cam_imu)
+
+
+def test_a_calibration_is_read_without_matplotlib() -> None:
+    code = "import sys, jaxcal; jaxcal.load_calibration; assert 'matplotlib' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 _SAVED: list[bytes] = []

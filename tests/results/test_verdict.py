@@ -116,9 +116,11 @@ def test_every_check_has_a_defect_that_fails_it() -> None:
 
 
 def test_a_warning_alone_makes_it_usable_with_care() -> None:
-    verdict = judge(dataclasses.replace(GOOD, warnings=("The rig hardly turned about x.", "cam1 saw little.")))
+    verdict = judge(dataclasses.replace(GOOD, warnings=("The rig hardly turned about x. Turn it.", "cam1 saw little.")))
     assert verdict.level == "usable"
-    assert verdict.headline == "Usable, but The rig hardly turned about x, and 1 more finding below."
+    assert verdict.headline == "Usable, but the rig hardly turned about x, and 1 more finding below."
+    alone = judge(dataclasses.replace(GOOD, warnings=("IMU samples are missing; 3 gaps.",)))
+    assert alone.headline == "Usable, but IMU samples are missing."
 
 
 def test_the_worst_finding_comes_first() -> None:

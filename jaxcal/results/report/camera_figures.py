@@ -2,7 +2,6 @@
 
 import numpy as np
 from matplotlib.patches import Circle, Rectangle
-from scipy.stats import norm
 
 from jaxcal.results.calibration import CameraCalibration
 from jaxcal.results.coverage import corner_counts, coverage
@@ -20,6 +19,7 @@ from jaxcal.results.report.drawing import (
     image_panel,
     label,
     legend,
+    normal_density,
     note,
     nothing_to_show,
     panel,
@@ -121,7 +121,7 @@ def _histogram_picture(camera: CameraCalibration, prefix: str) -> Picture:
         for axis, (name, colour) in enumerate((("u", X), ("v", Y))):
             density = np.histogram(used[:, axis] / _corner_sigma(camera), edges)[0] / (len(used) * 0.2)
             axes.step(centres, density, where="mid", color=colour, linewidth=1.2, label=name)
-        axes.plot(centres, norm.pdf(centres), "--", color=INK, linewidth=1.0, label="N(0, 1)")
+        axes.plot(centres, normal_density(centres), "--", color=INK, linewidth=1.0, label="N(0, 1)")
         legend(axes, loc="upper right")
         axes.set_ylim(bottom=0.0)
     else:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -112,6 +113,11 @@ def legend(axes: Axes, **options: object) -> None:
 def nothing_to_show(axes: Axes, text: str) -> None:
     """Say in the middle of empty axes why they are empty."""
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=MUTED, fontsize=_FONT_SIZE)
+
+
+def normal_density(x: np.ndarray) -> np.ndarray:
+    """The density of N(0, 1) at x, any shape."""
+    return np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
 
 
 def to_svg(figure: Figure, prefix: str) -> str:

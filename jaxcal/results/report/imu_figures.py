@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
 
 from jaxcal.results.calibration import ImuCalibration
 from jaxcal.results.report.drawing import (
@@ -14,6 +13,7 @@ from jaxcal.results.report.drawing import (
     Picture,
     label,
     legend,
+    normal_density,
     note,
     nothing_to_show,
     panel,
@@ -137,7 +137,7 @@ def _histogram_picture(sensor: _Sensor, prefix: str) -> Picture:
             axes.step(
                 centres, density, where="mid", color=colour, linewidth=1.2, label=f"{'xyz'[axis]}: rms {rms[axis]:.2f}"
             )
-    axes.plot(centres, norm.pdf(centres), "--", color=INK, linewidth=1.0, label="N(0, 1)")
+    axes.plot(centres, normal_density(centres), "--", color=INK, linewidth=1.0, label="N(0, 1)")
     axes.set_ylim(bottom=0.0)
     legend(axes, loc="upper right")
     beyond = float(np.mean(np.abs(normalised) > 5.0))
