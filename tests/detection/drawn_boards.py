@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+
 from jaxcal import AprilGrid, Checkerboard
 
 FINE = 6  # samples per pixel and axis
@@ -32,9 +33,7 @@ def board_to_pixel(
     for axis, angle in (((0, 0, 1), roll), ((1, 0, 0), tilt[0]), ((0, 1, 0), tilt[1])):
         rotation = cv2.Rodrigues(np.array(axis, np.float64) * angle)[0] @ rotation
     translation = np.array([0.0, 0.0, distance]) - rotation @ np.array([*centre, 0.0])
-    focal = np.array(
-        [[500.0, 0.0, (image_size[0] - 1) / 2], [0.0, 500.0, (image_size[1] - 1) / 2], [0.0, 0.0, 1.0]]
-    )
+    focal = np.array([[500.0, 0.0, (image_size[0] - 1) / 2], [0.0, 500.0, (image_size[1] - 1) / 2], [0.0, 0.0, 1.0]])
     return focal @ np.column_stack([rotation[:, 0], rotation[:, 1], translation])
 
 

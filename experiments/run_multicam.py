@@ -1,0 +1,127 @@
+"""The main job: calibrate all cameras and the IMU of a rig jointly, from ordinary recordings.
+
+Without arguments: simulate the built-in hybrid rig (two event cameras, two frame cameras, one IMU, a checkerboard),
+write it as ordinary recordings, calibrate it from those files alone, and print the result beside the truth.
+
+With --rig: calibrate what your rig.yaml names. All paths in it are relative to its folder:
+
+    target: target.yaml              # Kalibr's target.yaml, or its keys right here
+    cameras:
+      - name: cam0
+        model: pinhole-radtan        # pinhole-none, pinhole-radtan, pinhole-equi, or mypackage.mymodule:MyCamera
+        events: cam0/events.h5       # one of events (h5 with x, y, p, t in microseconds) ...
+        resolution: [640, 480]
+      - name: cam1
+        model: pinhole-radtan
+        frames: cam1                 # ... frames (EuRoC/ASL folder: data.csv and data/, or <time in ns>.png) ...
+      - name: cam2
+        model: pinhole-radtan
+        detections: observations.npz # ... or detections (of jaxcal, or a corner table with the prefix's columns)
+        prefix: cam0
+        resolution: [752, 480]
+    imu:                             # leave out to calibrate the cameras alone
+      data: imu0/data.csv            # EuRoC csv: time in ns, gyroscope rad/s, accelerometer m/s^2
+      noise: imu.yaml                # Kalibr's imu.yaml, or its keys right here
+    reconstruction:                  # optional
+      window_ms: 33                  # events of this long a time make one frame
+      network: null                  # weights; null: the network that comes with jaxcal
+
+A checkerboard's rows and columns are INNER corners. Nothing is guessed from names: no initial values are read.
+"""
+
+import argparse
+import logging
+import sys
+import time
+from pathlib import Path
+
+import platformdirs
+from tqdm import tqdm
+
+import jaxcal
+from jaxcal.pipeline import PipelineSettings, run_pipeline
+
+
+def main() -> int:
+    arguments = parse_arguments()
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    bars = ProgressBars()
+    try:
+        start = time.monotonic()
+        rig = arguments.rig or simulated_rig(arguments.recording, bars)
+        settings = (
+            PipelineSettings() if arguments.window_ms is None else PipelineSettings(window_ms=arguments.window_ms)
+        )
+        calibration = run_pipeline(rig, arguments.output, settings=settings, workers=arguments.workers, progress=bars)
+        bars.close()
+        print_result(calibration, rig.parent / "ground_truth.yaml", arguments.output)
+        print(f"done in {time.monotonic() - start:.0f} s")
+    except jaxcal.CalibrationError as error:
+        bars.close()
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rig", type=Path, help="your rig.yaml; without it the built-in rig is simulated")
+    parser.add_argument(
+        "--output", type=Path, default=Path("out/multicam"), help="folder for the results (%(default)s)"
+    )
+    parser.add_argument(
+        "--recording", type=Path, help="folder for the simulated recording (default: in the user's cache folder)"
+    )
+    parser.add_argument("--window-ms", type=float, help="length of an event window, where rig.yaml does not say")
+    parser.add_argument("--workers", type=int, help="processes for simulation and detection (default: one per core)")
+    return parser.parse_args()
+
+
+def simulated_rig(recording: Path | None, bars: "ProgressBars") -> Path:
+    """The rig.yaml of the built-in rig's recording, simulated unless it is there already."""
+    from jaxcal.simulation import paper_rig, write_recording
+
+    folder = recording or Path(platformdirs.user_cache_dir("jaxcal")) / "recordings" / "paper_rig"
+    return write_recording(paper_rig(), folder, progress=bars, workers=2)
+
+
+def print_result(calibration: jaxcal.Calibration, ground_truth: Path, output: Path) -> None:
+    """The summary, the comparison with the truth where there is one, and where the files are."""
+    from jaxcal.results import results_text
+    from jaxcal.results.ground_truth import compare_with_ground_truth, comparison_table
+
+    if ground_truth.exists():  # written by the simulator, and read only now that the calibration is finished
+        print(comparison_table(compare_with_ground_truth(calibration, ground_truth)))
+        for camera in calibration.cameras:
+            print(f"{camera.name}: reprojection error {camera.reprojection_rms_px:.3f} px rms")
+    else:
+        print(results_text(calibration))
+    for warning in calibration.warnings:
+        print(f"warning: {warning}")
+    print(f"report: {(output / 'report.html').resolve()}")
+    print(f"all results: {output.resolve()}")
+
+
+class ProgressBars:
+    """Progress callbacks as tqdm bars, one per stage; silent where nobody watches a terminal."""
+
+    def __init__(self) -> None:
+        self._bars: dict[str, tqdm] = {}
+        self._silent = not sys.stderr.isatty()
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        if stage not in self._bars:
+            self._bars[stage] = tqdm(desc=stage, total=total, disable=self._silent, leave=True)
+        bar = self._bars[stage]
+        if bar.total != total:
+            bar.reset(total)
+        bar.update(done - bar.n)
+
+    def close(self) -> None:
+        for bar in self._bars.values():
+            bar.close()
+        self._bars.clear()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,114 @@
+"""Checkerboard corners: numbered the same way at every roll, in the right place, never mirrored."""
+
+import cv2
+import numpy as np
+import pytest
+from drawn_boards import View, board_to_pixel, draw_checkerboard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxcal import Checkerboard
+from jaxcal.detection import find_corners
+
+SIZE = (320, 240)
+BOARD = Checkerboard(rows=4, cols=5, spacing=0.06)
+ANGLES = st.floats(-np.pi, np.pi)
+TILTS = st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
+
+
+def view(board: Checkerboard, roll: float, tilt: tuple[float, float] = (0.0, 0.0), noise: float = 0) -> View:
+    centre = (board.points[:, 0].mean(), board.points[:, 1].mean())
+    return draw_checkerboard(board, board_to_pixel(centre, 1.05, roll, tilt, SIZE), SIZE, noise)
+
+
+def rms(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+@given(roll=ANGLES, tilt=TILTS, shape=st.sampled_from([(4, 5), (5, 4), (3, 6), (6, 3)]))
+@settings(deadline=None, max_examples=40)
+def test_one_corner_has_one_number_at_any_roll(roll: float, tilt: tuple[float, float], shape: tuple[int, int]) -> None:
+    board = Checkerboard(*shape, spacing=0.06)
+    drawn = view(board, roll, tilt)
+    point, pixels = find_corners(drawn.image, board)
+    assert len(point) == len(board.points)
+    assert np.abs(pixels - drawn.pixels[point]).max() < 0.1
+
+
+@given(roll=st.floats(-1.4, 1.4), tilt=TILTS, shape=st.sampled_from([(4, 6), (3, 5), (5, 3)]))
+@settings(deadline=None, max_examples=25)
+def test_boards_that_look_the_same_upside_down_are_numbered_nearest_to_upright(
+    roll: float, tilt: tuple[float, float], shape: tuple[int, int]
+) -> None:
+    board = Checkerboard(*shape, spacing=0.06)
+    # An uneven view moves the direction in which the board "stands" a little: leave a margin round 90 degrees.
+    drawn = view(board, roll, (0.5 * tilt[0], 0.5 * tilt[1]))
+    point, pixels = find_corners(drawn.image, board)
+    assert len(point) == len(board.points)
+    assert np.abs(pixels - drawn.pixels[point]).max() < 0.1
+    _, upside_down = find_corners(np.ascontiguousarray(drawn.image[::-1, ::-1]), board)
+    turned = np.array(SIZE) - 1.0 - upside_down
+    assert np.abs(turned[::-1] - pixels).max() < 0.1
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.7, -0.7])
+def test_square_boards(roll: float) -> None:
+    # 4 x 4 looks the same at each quarter turn, 3 x 3 at half a turn.
+    for count in (3, 4):
+        board = Checkerboard(count, count, spacing=0.06)
+        drawn = view(board, roll)
+        point, pixels = find_corners(drawn.image, board)
+        assert len(point) == count**2
+        assert np.abs(pixels - drawn.pixels[point]).max() < 0.1
+
+
+def test_3_x_3_is_numbered_by_colour_where_a_quarter_turn_is_nearer_to_upright() -> None:
+    board = Checkerboard(3, 3, spacing=0.06)
+    drawn = view(board, 1.2)
+    point, pixels = find_corners(drawn.image, board)
+    assert np.abs(pixels - drawn.pixels[point]).max() < 0.1
+
+
+@pytest.mark.parametrize(("noise", "limit"), [(0, 0.03), (4, 0.06), (8, 0.1)])
+def test_accuracy(noise: float, limit: float) -> None:
+    errors, count = [], 0
+    for k in range(8):
+        drawn = view(BOARD, 0.8 * k, (0.1 * k - 0.4, 0.3 - 0.08 * k), noise)
+        point, pixels = find_corners(drawn.image, BOARD)
+        errors.append(pixels - drawn.pixels[point])
+        count += len(point)
+    assert count == 8 * len(BOARD.points)
+    assert rms(np.concatenate(errors)) < limit
+    assert np.abs(np.concatenate(errors).mean(axis=0)).max() < 0.3 * limit
+
+
+def test_refinement_stays_clear_of_neighbours_in_small_boards() -> None:
+    board = Checkerboard(6, 9, spacing=0.02)
+    centre = (board.points[:, 0].mean(), board.points[:, 1].mean())
+    drawn = draw_checkerboard(board, board_to_pixel(centre, 1.0, 0.3, (0.2, 0.1), SIZE), SIZE)
+    point, pixels = find_corners(drawn.image, board)
+    assert len(point) == 54
+    assert np.abs(pixels - drawn.pixels[point]).max() < 0.1
+
+
+def test_dim_blurred_and_uneven_light() -> None:
+    drawn = view(BOARD, 0.2, (0.3, 0.0))
+    shade = np.linspace(0.15, 0.5, SIZE[0])
+    dim = np.clip(cv2.GaussianBlur(drawn.image, (0, 0), 1.5) * shade + 5, 0, 255).astype(np.uint8)
+    point, pixels = find_corners(dim, BOARD)
+    assert len(point) == len(BOARD.points)
+    assert rms(pixels - drawn.pixels[point]) < 0.1
+
+
+@pytest.mark.parametrize("noise", [0, 20])
+def test_no_board_no_corners(noise: float) -> None:
+    rng = np.random.default_rng(2)
+    blank = np.clip(rng.normal(120, noise, (SIZE[1], SIZE[0])), 0, 255).astype(np.uint8)
+    point, pixels = find_corners(blank, BOARD)
+    assert point.shape == (0,)
+    assert pixels.shape == (0, 2)
+
+
+def test_a_board_of_another_size_is_not_taken_for_this_one() -> None:
+    point, _ = find_corners(view(BOARD, 0.0).image, Checkerboard(7, 8, spacing=0.06))
+    assert len(point) == 0
