@@ -218,7 +218,9 @@ def render_some(
 
 
 @jax.jit
-def near_edges(rays: PixelRays, matrix: Float32[Array, "3 3"], surface: Surface, band_px: float) -> Bool[Array, " n"]:
+def near_edges(
+    rays: PixelRays, matrix: Float32[Array, "3 3"], surface: Surface, band_px: float | Float[Array, ""]
+) -> Bool[Array, " n"]:
     """Which of N pixels lie within `band_px` of a line of the pattern, seen from one pose."""
     at = _footprint(rays, matrix, 1.0)
     band_x, band_y = band_px * at.sigma_x, band_px * at.sigma_y
