@@ -20,7 +20,7 @@ from jaxcal.results.report.camera_figures import frame_rms
 from jaxcal.results.report.drawing import label, panel, to_svg
 from jaxcal.results.report.frames import frame_pictures
 from jaxcal.results.report.imu_figures import _envelope
-from jaxcal.results.report.rig_figures import rig_poses
+from jaxcal.results.report.rig_figures import rig_pictures, rig_poses
 
 VOID = {"meta", "link", "br", "hr", "img", "input"}
 CAMERA_FIGURES, IMU_FIGURES = 6, 9
@@ -179,6 +179,12 @@ def test_eight_cameras_without_imu_nor_images(tmp_path: Path) -> None:
     assert "frame" not in {attributes.get("class") for _, attributes, _ in page.elements}
     assert "gravity" not in text.lower()
     assert len(text) < 8e6
+
+
+def test_drawing_a_rig_gives_matplotlib_nothing_to_complain_of(caplog: pytest.LogCaptureFixture) -> None:
+    for cameras in (1, 2, 5):
+        rig_pictures(make_calibration(cameras, True, frames=4), "rig")
+    assert caplog.records == []
 
 
 def test_one_camera_that_contributed_nothing(tmp_path: Path) -> None:

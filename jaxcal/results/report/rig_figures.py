@@ -143,7 +143,6 @@ def _scale_bar(axes: Axes) -> None:
             length = factor * length
             break
     x, y = low + 0.04 * span, bottom - 0.12 * (top - bottom)
-    axes.set_ylim(bottom - 0.2 * (top - bottom), top)
     axes.plot([x, x + length], [y, y], color=INK, linewidth=2.0, solid_capstyle="butt")
     text = f"{length * 1e3:g} mm" if length < 1.0 else f"{length:g} m"
     axes.annotate(text, (x + length / 2.0, y), (0, 4), textcoords="offset points", ha="center", fontsize=8, color=INK)
