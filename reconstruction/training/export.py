@@ -71,7 +71,8 @@ No recordings, no third-party images.
 
 ## Recipe
 
-`python -m reconstruction.training --output models/`, {seconds / 60:.0f} minutes of training on one CPU core.
+`python -m reconstruction.training --output models/`, {seconds / 60:.0f} minutes of training with one thread
+on a shared machine with two CPU cores.
 Loss: L1 of the image + {recipe.gradient_weight} x L1 of its differences. AdamW {recipe.learning_rate}, linear decay to
 zero, gradient norm clipped at {recipe.clip_norm}, weights averaged (decay {recipe.average_decay}); bfloat16.
 

@@ -40,7 +40,12 @@ class Window:
 
 @dataclass(frozen=True)
 class Scene:
-    """A board on its way: `pattern`, `view`, `path`, `travelled` (windows * samples + 1,) pixels of motion so far."""
+    """A board on its way before an event camera.
+
+    `travelled` (windows * samples + 1,) pixels of image motion so far, `samples` times per window of `window_us`
+    microseconds; `blur_px` standard deviation of the lens's blur; `black_to_white` intensity of black over that of
+    white.
+    """
 
     pattern: Pattern
     view: View
