@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.calibration.state import RigState, SharedLayout, tangent_basis
-from jaxcal.estimation import BlockArrow, factorise
+from jaxcal.estimation import BlockArrow, factorise, single_threaded_blas
 
 # Eigenvalues of the information matrix, scaled to unit diagonal, below which a direction counts as unobserved.
 _UNOBSERVED = 1e-11
@@ -26,7 +26,8 @@ def shared_covariance(
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Covariance (P, P) of the shared parameters (zero where held), marginal covariance (K, B, B) of the chain blocks,
     and sentences about directions that the data leave open."""
-    schur, chain = (np.asarray(part) for part in _schur(equations))
+    with single_threaded_blas():
+        schur, chain = (np.asarray(part) for part in _schur(equations))
     information = schur[np.ix_(free, free)]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])

@@ -11,6 +11,7 @@ from jaxcal.estimation.descent import BlockArrowDescent, BlockStep, damped_step
 from jaxcal.estimation.losses import huber
 from jaxcal.estimation.problem import BlockArrowProblem, State
 from jaxcal.estimation.solver import BlockArrowLevenbergMarquardt, SolveResult, solve
+from jaxcal.estimation.threads import single_threaded_blas
 
 __all__ = [
     "BlockArrow",
@@ -26,5 +27,6 @@ __all__ = [
     "damped_step",
     "factorise",
     "huber",
+    "single_threaded_blas",
     "solve",
 ]

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxcal.estimation.block_arrow import BlockArrow
 from jaxcal.estimation.descent import BlockArrowDescent, BlockStep
 from jaxcal.estimation.problem import BlockArrowProblem, State
+from jaxcal.estimation.threads import single_threaded_blas
 
 _MAX_HISTORY = 256
 _FIRST_DAMPING = 1e-4
@@ -154,7 +155,6 @@ class SolveResult(eqx.Module):
     converged: Bool[Array, ""]
 
 
-@eqx.filter_jit
 def solve(
     problem: BlockArrowProblem,
     state: State,
@@ -163,6 +163,14 @@ def solve(
     max_steps: int = 100,
 ) -> SolveResult:
     """Minimise a block-arrow problem from `state`; one compiled program per problem shape."""
+    with single_threaded_blas():
+        return jax.block_until_ready(_solve(problem, state, solver or BlockArrowLevenbergMarquardt(), max_steps))
+
+
+@eqx.filter_jit
+def _solve(
+    problem: BlockArrowProblem, state: State, solver: BlockArrowLevenbergMarquardt, max_steps: int
+) -> SolveResult:
 
     # optimistix traces the residual function, which this solver never evaluates: it works on normal equations.
     def untouched(y: State, args: Any) -> Array:
@@ -170,7 +178,7 @@ def solve(
 
     solution = optx.least_squares(
         untouched,
-        solver or BlockArrowLevenbergMarquardt(),
+        solver,
         state,
         options={"problem": problem},
         max_steps=max_steps,

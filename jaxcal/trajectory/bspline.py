@@ -85,32 +85,29 @@ def rotation_at(
     computation for cumulative B-splines on Lie groups", eq. 30), Jacobians by the chain rule over the same recursion.
     """
     matrix = cumulative_basis_matrix(order)
-    value, rate = weights(matrix, u, dt, 0), weights(matrix, u, dt, 1)
-    rotation, velocity = first, jnp.zeros(3)
-    by_first = jnp.eye(3)
-    by_increment: list[tuple[Array, Array]] = []  # (rotation, velocity) by each increment so far
-    velocity_by_first = jnp.zeros((3, 3))
-    for j in range(order - 1):
-        vector = window.vector[j]
-        turn = so3.exp(value[j + 1] * vector)
-        stretch = value[j + 1] * so3.right_jacobian(value[j + 1] * vector)
-        rotation = rotation @ turn
-        carried = turn.T @ velocity
-        velocity = carried + rate[j + 1] * vector
-        by_first = turn.T @ by_first
-        by_increment = [(turn.T @ r, turn.T @ v) for r, v in by_increment]
-        by_increment.append((stretch, so3.hat(carried) @ stretch + rate[j + 1] * jnp.eye(3)))
+    value, rate = weights(matrix, u, dt, 0)[1:], weights(matrix, u, dt, 1)[1:]
+    scaled = value[:, None] * window.vector
+    turn, stretch = jax.vmap(so3.exp_with_right_jacobian)(scaled)
+    stretch = stretch * value[:, None, None]
 
-    rotation_jacobian = [by_first] + [jnp.zeros((3, 3))] * (order - 1)
-    velocity_jacobian = [velocity_by_first] + [jnp.zeros((3, 3))] * (order - 1)
-    for j, (r, v) in enumerate(by_increment):
-        rotation_jacobian[j] = rotation_jacobian[j] + r @ window.by_left[j]
-        velocity_jacobian[j] = velocity_jacobian[j] + v @ window.by_left[j]
-        rotation_jacobian[j + 1] = rotation_jacobian[j + 1] + r @ window.by_right[j]
-        velocity_jacobian[j + 1] = velocity_jacobian[j + 1] + v @ window.by_right[j]
-    return RotationPoint(
-        rotation, velocity, jnp.stack(rotation_jacobian, axis=1), jnp.stack(velocity_jacobian, axis=1)
-    )
+    # after[j]: the turns that follow increment j, as one rotation; carried[j]: the velocity so far, after turn j.
+    after = [jnp.eye(3)]
+    for j in range(order - 2, -1, -1):
+        after.insert(0, turn[j] @ after[0])
+    velocity, carried = jnp.zeros(3), []
+    for j in range(order - 1):
+        carried.append(turn[j].T @ velocity)
+        velocity = carried[-1] + rate[j] * window.vector[j]
+    rotation = first @ after[0]
+
+    # By each increment, right after it; then carried through the turns that follow.
+    following = jnp.stack(after[1:]).swapaxes(-1, -2)
+    by_velocity = jax.vmap(so3.hat)(jnp.stack(carried)) @ stretch + rate[:, None, None] * jnp.eye(3)
+    by_increment = jnp.concatenate([following @ stretch, following @ by_velocity], axis=1)  # (k - 1, 6, 3)
+    jacobian = jnp.pad(by_increment @ window.by_left, [(0, 1), (0, 0), (0, 0)])
+    jacobian = jacobian + jnp.pad(by_increment @ window.by_right, [(1, 0), (0, 0), (0, 0)])
+    jacobian = jacobian.at[0, :3].add(after[0].T).swapaxes(0, 1)
+    return RotationPoint(rotation, velocity, jacobian[:3], jacobian[3:])
 
 
 class PoseSpline(eqx.Module):

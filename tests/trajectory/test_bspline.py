@@ -79,14 +79,16 @@ def test_closed_form_jacobians_equal_autodiff(order: int, u: float, seed: int) -
 @jax.jit
 def right_jacobians(vector: jax.Array) -> tuple:
     by_autodiff = jax.jacfwd(lambda d: so3.log(so3.exp(vector).T @ so3.exp(vector + d)))(jnp.zeros(3))
-    return so3.right_jacobian(vector), so3.right_jacobian_inverse(vector), by_autodiff
+    rotation, jacobian = so3.exp_with_right_jacobian(vector)
+    return jacobian, so3.right_jacobian_inverse(vector), by_autodiff, rotation - so3.exp(vector)
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.floats(-2.0, 2.0), min_size=3, max_size=3), st.floats(1e-9, 1.0))
 def test_right_jacobian_and_its_inverse(direction: list[float], scale: float) -> None:
     vector = jnp.asarray(direction) * scale
-    closed, inverse, by_autodiff = right_jacobians(vector)
+    closed, inverse, by_autodiff, difference = right_jacobians(vector)
+    np.testing.assert_allclose(difference, 0.0, atol=1e-12)
     np.testing.assert_allclose(closed, by_autodiff, atol=1e-6)
     np.testing.assert_allclose(closed @ inverse, np.eye(3), atol=1e-9)
 
