@@ -29,6 +29,7 @@ _PADDING = 1 << 13
 # Beyond this many standard deviations of blur from an edge a pixel is of one colour.
 _BLUR_REACH = 3.3
 _TIME_GRID_S = 4e-3
+_SPEED_STEP_S = 1e-3
 
 
 class _Scene:
@@ -94,20 +95,28 @@ def simulate_events(rig: SimulatedRig, index: int) -> Iterator[tuple[float, Even
 
 def render_times(rig: SimulatedRig, camera: SimulatedCamera) -> np.ndarray:
     """Times of the motion (K,), seconds, between which the target moves by at most `imaging.step_px` in the image."""
-    count = int(np.ceil(rig.duration_s / _TIME_GRID_S)) + 1
-    grid = np.linspace(0.0, rig.duration_s, count)
-    step = grid[1] - grid[0]
-    points = jnp.asarray(_spread_points(pattern_of(rig.target)))
-    pixels, real = (
-        np.asarray(a) for a in project_points(camera.model, jnp.asarray(T_cam_target(rig, camera, grid)), points)
+    grid, speed = _image_speed(rig, camera)
+    fastest = np.maximum(speed[1:], speed[:-1])
+    path = np.concatenate(
+        [[0.0], np.cumsum(np.diff(grid) * np.maximum(fastest / rig.imaging.step_px, 1.0 / rig.imaging.step_s))]
     )
-    size = np.array(camera.image_size)
-    seen = real & np.all((pixels > -0.1 * size) & (pixels < 1.1 * size), axis=-1)
-    moved = np.linalg.norm(np.diff(pixels, axis=0), axis=-1) * (seen[1:] & seen[:-1])
-    # 5 % in hand: the sample points bound the motion of those between them only nearly.
-    steps = np.maximum(1.05 * moved.max(axis=1) / rig.imaging.step_px, step / rig.imaging.step_s)
-    path = np.concatenate([[0.0], np.cumsum(steps)])
     return np.interp(np.linspace(0.0, path[-1], int(np.ceil(path[-1])) + 1), path, grid)
+
+
+def _image_speed(rig: SimulatedRig, camera: SimulatedCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Times of the motion (N,), s, and how fast the target's fastest point in view moves in the image then, px/s."""
+    grid = np.linspace(0.0, rig.duration_s, int(np.ceil(rig.duration_s / _TIME_GRID_S)) + 1)
+    points = jnp.asarray(_spread_points(pattern_of(rig.target)))
+    ends = np.concatenate([grid - 0.5 * _SPEED_STEP_S, grid + 0.5 * _SPEED_STEP_S])
+    pixels, real = project_points(camera.model, jnp.asarray(T_cam_target(rig, camera, ends)), points)
+    before, after = np.split(np.asarray(pixels), 2)
+    size = np.array(camera.image_size)
+    seen = np.logical_and(*np.split(np.asarray(real), 2)) & np.all(
+        (after > -0.1 * size) & (after < 1.1 * size), axis=-1
+    )
+    moved = np.linalg.norm(after - before, axis=-1) * seen
+    # Some in hand: these points bound the speed of those between them, and of times between these, only nearly.
+    return grid, 1.05 * moved.max(axis=1) / _SPEED_STEP_S
 
 
 def _spread_points(pattern: Pattern) -> np.ndarray:
@@ -125,21 +134,15 @@ def simulate_frames(rig: SimulatedRig, index: int) -> Iterator[tuple[int, np.nda
     """
     camera, scene, imaging = rig.cameras[index], _Scene(rig, rig.cameras[index]), rig.imaging
     times_ns = rig.frame_times_ns(camera)
+    middles = rig.motion_time(camera, times_ns)
     within = imaging.exposure_s * ((np.arange(imaging.exposure_samples) + 0.5) / imaging.exposure_samples - 0.5)
-    for number, (time_ns, middle) in enumerate(zip(times_ns, rig.motion_time(camera, times_ns), strict=True)):
-        image = scene.whole(scene.matrices(np.array([middle]))[0])
+    whole = scene.matrices(middles)
+    moving = scene.matrices((middles[:, None] + within).ravel()).reshape(len(middles), -1, 3, 3)
+    motion_px = 0.5 * imaging.exposure_s * np.interp(middles, *_image_speed(rig, camera))
+    for number, time_ns in enumerate(times_ns.tolist()):
+        image = scene.whole(whole[number])
         if imaging.exposure_samples > 1:
-            matrices = scene.matrices(middle + within)
-            chosen, intensities = scene.near_edges(matrices, _motion_px(rig, camera, middle, imaging.exposure_s))
+            chosen, intensities = scene.near_edges(moving[number], float(motion_px[number]))
             image.reshape(-1)[chosen] = intensities.mean(axis=0)
-        noise = rig.generator(_FRAMES, index, number).standard_normal(image.shape)
-        yield int(time_ns), np.clip(np.round(255.0 * image + imaging.grey_noise * noise), 0, 255).astype(np.uint8)
-
-
-def _motion_px(rig: SimulatedRig, camera: SimulatedCamera, middle_s: float, exposure_s: float) -> float:
-    """How far, at most, points of the pattern in view move in the image within an exposure."""
-    T = T_cam_target(rig, camera, middle_s + exposure_s * np.array([-0.5, 0.0, 0.5]))
-    points = jnp.asarray(_spread_points(pattern_of(rig.target)))
-    pixels, real = (np.asarray(a) for a in project_points(camera.model, jnp.asarray(T), points))
-    moved = np.linalg.norm(pixels[2] - pixels[0], axis=-1)[real.all(axis=0)]
-    return 1.05 * float(moved.max(initial=0.0)) + 0.5
+        noise = imaging.grey_noise * rig.generator(_FRAMES, index, number).standard_normal(image.shape)
+        yield time_ns, np.clip(np.round(255.0 * image + noise), 0, 255).astype(np.uint8)

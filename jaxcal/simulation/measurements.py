@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import Detections, ImuRecording
-from jaxcal.simulation.motion import poses, rates
+from jaxcal.simulation.motion import poses_at, rates
 from jaxcal.simulation.rig import SimulatedCamera, SimulatedRig
 from jaxcal.targets import AprilGrid
 
@@ -19,8 +19,7 @@ _IMU, _DETECTIONS = 11, 12
 
 def T_cam_target(rig: SimulatedRig, camera: SimulatedCamera, motion_time_s: np.ndarray) -> np.ndarray:
     """Poses (F, 4, 4) of the target in the camera's frame at motion times (F,), seconds on the IMU's clock."""
-    T_target_imu = np.asarray(poses(rig.motion, jnp.asarray(motion_time_s, dtype=jnp.float64)))
-    return camera.T_cam_imu @ np.linalg.inv(T_target_imu)
+    return camera.T_cam_imu @ np.linalg.inv(poses_at(rig.motion, motion_time_s))
 
 
 @eqx.filter_jit
@@ -97,7 +96,7 @@ def simulate_imu(rig: SimulatedRig, noisy: bool = True) -> ImuRecording:
     count = int(np.floor(rig.duration_s * rate)) + 1
     own_ns = np.round(np.arange(count) * 1e9 / rate).astype(np.int64)
     times = jnp.asarray(own_ns * 1e-9)
-    R_imu_target = np.swapaxes(np.asarray(poses(rig.motion, times))[:, :3, :3], 1, 2)
+    R_imu_target = np.swapaxes(poses_at(rig.motion, own_ns * 1e-9)[:, :3, :3], 1, 2)
     omega, acceleration = (np.asarray(values) for values in rates(rig.motion, times))
     force = np.einsum("nij,nj->ni", R_imu_target, acceleration - rig.gravity)
 

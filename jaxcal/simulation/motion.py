@@ -6,7 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
+
+_SHORTEST = 256
 
 
 class Motion(eqx.Module):
@@ -65,6 +68,15 @@ def _derivative(function: Callable[[Array], Array], t: Float[ArrayLike, ""]) -> 
 def poses(motion: Motion, times_s: Float[Array, " n"]) -> Float[Array, "n 4 4"]:
     """T_target_imu at each of `times_s` (n,) seconds."""
     return jax.vmap(motion.pose)(times_s)
+
+
+def poses_at(motion: Motion, times_s: np.ndarray) -> np.ndarray:
+    """`poses` of a numpy array of times (n,), compiled for few lengths only."""
+    length = _SHORTEST
+    while length < len(times_s):
+        length *= 4
+    padded = np.pad(np.asarray(times_s, dtype=np.float64), (0, length - len(times_s)))
+    return np.asarray(poses(motion, jnp.asarray(padded)))[: len(times_s)]
 
 
 @eqx.filter_jit
