@@ -10,12 +10,15 @@ import numpy as np
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
 from jaxcal.results.coverage import coverage
 from jaxcal.results.parameters import camera_estimates, sigma_of, timeshift_estimate
+from jaxcal.results.target_bias import target_bias
+from jaxcal.targets import Target
 
 Level = Literal["good", "usable", "bad"]
 
 # Limits beyond which a figure makes a result (usable with care, bad). They are rules of thumb, in one place.
 _RMS_PX = (1.0, 3.0)  # for images up to 2000 px wide; in proportion beyond
 _RMS_OVER_NOISE = (1.5, 4.0)  # 1 when the residuals are Gaussian
+_TARGET_BIAS = 0.4  # share of the corner noise that is the same in every frame
 _FOCAL_SIGMA = (0.005, 0.03)  # relative
 _COVERAGE = (0.5, 0.15)
 _INLIERS = (0.9, 0.5)
@@ -113,6 +116,7 @@ def _checks(calibration: Calibration) -> Iterator[Check]:
     yield from _solution_checks(calibration)
     for index, camera in enumerate(calibration.cameras):
         yield from _residual_checks(camera)
+        yield from _target_checks(camera, calibration.target)
         yield from _view_checks(camera)
         yield from _lens_checks(calibration, index)
         yield from _pose_checks(calibration, camera)
@@ -177,6 +181,22 @@ def _residual_checks(camera: CameraCalibration) -> Iterator[Check]:
         _below(share, _INLIERS),
         f"{camera.name} had many corners rejected as outliers" if total else f"{camera.name} contributed no corner",
         "Check that target.yaml describes the board in the pictures, and that the detections sit on the corners.",
+    )
+
+
+def _target_checks(camera: CameraCalibration, target: Target) -> Iterator[Check]:
+    bias = target_bias(camera, target).rms_px
+    if not np.isfinite(bias) or not camera.corner_sigma_px > 0:
+        return
+    share = bias / (np.sqrt(2.0) * camera.corner_sigma_px)
+    yield Check(
+        camera.name,
+        "target points' own error",
+        f"{bias:.3f} px, {100.0 * share:.0f} % of the noise",
+        f"under {100.0 * _TARGET_BIAS:.0f} % of the noise",
+        "usable" if share > _TARGET_BIAS else "good",
+        f"{camera.name} sees the target's points {bias:.2f} px off where target.yaml has them, always the same way",
+        "Measure the board's size, spacing and flatness; if they are right, the detector shifts the corners.",
     )
 
 

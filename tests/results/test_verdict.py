@@ -50,6 +50,8 @@ DEFECTS: dict[str, tuple[Callable[[float], Calibration], float, float, str]] = {
     "reprojection error": (
         lambda f: with_camera(1, residuals_px=f * RESIDUALS, corner_sigma_px=f * 0.12), 10.0, 40.0, "misses"),
     "error over corner noise": (lambda f: with_camera(1, corner_sigma_px=0.12 / f), 2.0, 6.0, "noise"),
+    "target points' own error": (
+        lambda f: with_camera(1, residuals_px=RESIDUALS + shifts(f)), 0.15, 0.15, "target.yaml"),
     "corners kept": (lambda f: with_camera(1, inlier=every_other(1.0 - f)), 0.2, 0.7, "rejected"),
     "frames used": (lambda f: with_camera(1, residuals_px=first_frames(int(f))), 6, 2, "frames"),
     "image covered": (lambda f: with_camera(1, detections=shrunk(f)), 0.5, 0.01, "visited only"),
@@ -72,6 +74,12 @@ def every_other(keep: float) -> np.ndarray:
     return np.random.default_rng(0).random(len(RESIDUALS)) < keep
 
 
+def shifts(pixels: float) -> np.ndarray:
+    """An error of each target point that is the same in all frames."""
+    angle = np.random.default_rng(1).uniform(0.0, 2.0 * np.pi, len(GOOD.target.points))
+    return pixels * np.stack([np.cos(angle), np.sin(angle)], axis=1)[GOOD.cameras[1].detections.point]
+
+
 def first_frames(count: int) -> np.ndarray:
     residuals = RESIDUALS.copy()
     residuals[GOOD.cameras[1].detections.frame >= count] = np.nan
@@ -88,7 +96,9 @@ def shifted(pixels: float) -> Any:
     return MODEL.with_parameters(parameters.at[2].add(pixels))
 
 
-@pytest.mark.parametrize("title", sorted(set(DEFECTS) - {"principal point", "numbers", "convergence"}))
+@pytest.mark.parametrize(
+    "title", sorted(set(DEFECTS) - {"principal point", "numbers", "convergence", "target points' own error"})
+)
 def test_each_defect_weakens_and_then_spoils_the_result(title: str) -> None:
     make, weak, spoilt, word = DEFECTS[title]
     verdict = judge(make(weak))
@@ -108,6 +118,13 @@ def test_some_defects_leave_no_middle(title: str) -> None:
     make, size, _, word = DEFECTS[title]
     verdict = judge(make(size))
     assert verdict.level == "bad"
+    assert word in verdict.headline
+
+
+def test_a_biased_target_weakens_the_result() -> None:
+    make, size, _, word = DEFECTS["target points' own error"]
+    verdict = judge(make(size))
+    assert verdict.level == "usable"
     assert word in verdict.headline
 
 

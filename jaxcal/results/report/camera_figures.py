@@ -14,30 +14,28 @@ from jaxcal.results.report.drawing import (
     REJECTED,
     WARN,
     Picture,
-    X,
-    Y,
     image_panel,
     label,
-    legend,
-    normal_density,
     note,
     nothing_to_show,
     panel,
     to_svg,
 )
+from jaxcal.results.target_bias import target_bias
+from jaxcal.targets import Target
 
 _FIELD_CELLS = (16, 12)
 _FEWEST_FOR_MEAN = 4
 _RADIUS_BINS = 12
 
 
-def camera_pictures(camera: CameraCalibration, prefix: str) -> list[Picture]:
+def camera_pictures(camera: CameraCalibration, target: Target, prefix: str) -> list[Picture]:
     """All figures of a camera, in the order in which they are read; `prefix` is unique in the page."""
     return [
         _coverage_picture(camera, f"{prefix}-coverage"),
         _scatter_picture(camera, f"{prefix}-scatter"),
-        _histogram_picture(camera, f"{prefix}-histogram"),
         _field_picture(camera, f"{prefix}-field"),
+        _target_picture(camera, target, f"{prefix}-target"),
         _radial_picture(camera, f"{prefix}-radial"),
         _frames_picture(camera, f"{prefix}-frames"),
     ]
@@ -108,31 +106,37 @@ def _scatter_picture(camera: CameraCalibration, prefix: str) -> Picture:
         f"Projection minus measurement; circles at 1 and 3 sigma ({sigma:.3f} px), {100 * inside:.1f} % within 3 sigma "
         f"(98.9 % if Gaussian); {len(rejected)} rejected corners in red.",
         "one round cloud, centred on zero.",
-        "a long tail points to wrong detections, a stretched cloud to motion blur, several clouds to bad frames.",
+        "a long tail points to wrong detections, a stretched cloud to motion blur, a cross to corners that are "
+        "shifted along the target's lines.",
     )
 
 
-def _histogram_picture(camera: CameraCalibration, prefix: str) -> Picture:
+def _target_picture(camera: CameraCalibration, target: Target, prefix: str) -> Picture:
     figure, (axes,) = panel()
-    used = camera.residuals_px[camera.used]
-    if len(used) and _corner_sigma(camera) > 0:
-        edges = np.linspace(-5.0, 5.0, 51)
-        centres = (edges[1:] + edges[:-1]) / 2.0
-        for axis, (name, colour) in enumerate((("u", X), ("v", Y))):
-            density = np.histogram(used[:, axis] / _corner_sigma(camera), edges)[0] / (len(used) * 0.2)
-            axes.step(centres, density, where="mid", color=colour, linewidth=1.2, label=name)
-        axes.plot(centres, normal_density(centres), "--", color=INK, linewidth=1.0, label="N(0, 1)")
-        legend(axes, loc="upper right")
-        axes.set_ylim(bottom=0.0)
+    sigma = _corner_sigma(camera)
+    bias = target_bias(camera, target)
+    x, y = target.points[:, 0], target.points[:, 1]
+    pitch = float(np.sqrt(np.ptp(x) * np.ptp(y) / len(x)))
+    axes.plot(x, y, ".", color=MUTED, markersize=2.0)
+    if len(bias.point) and sigma > 0:
+        arrows = bias.mean_px / sigma * pitch
+        axes.quiver(
+            x[bias.point], y[bias.point], arrows[:, 0], arrows[:, 1],
+            angles="xy", scale_units="xy", scale=1.0, color=ACCENT, width=0.0045,
+        )  # fmt: skip
     else:
-        nothing_to_show(axes, "no corner used")
-    label(axes, "error / corner sigma", "density")
+        nothing_to_show(axes, "too few corners for means")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.08)
+    axes.grid(visible=False)
+    label(axes, "x of the target [m]", "y of the target [m]")
     return Picture(
-        "Distribution",
+        "Mean residual over the target",
         to_svg(figure, prefix),
-        "Residuals of each coordinate over the corner noise, against the normal curve.",
-        "both lines on the dashed one.",
-        "a sharp peak with wide feet means that a few frames or corners are much worse than the others.",
+        f"Mean residual of each point, turned into the target's directions; one corner sigma ({sigma:.3f} px) is drawn "
+        f"one point spacing long. Systematic part: {bias.rms_px:.3f} px rms.",
+        "arrows too short to see a pattern.",
+        "a pattern that repeats from tag to tag is a biased detector or a wrong spacing; a smooth one, a bent board.",
     )
 
 
