@@ -103,11 +103,21 @@ def _settings(network: FoldedFireNet) -> str:
 
 
 def _stage_rows(recipe: Recipe) -> str:
-    return "\n".join(
-        f"| {recipe.cycles.index(cycle) + 1} | {cycle.learning_rate:g} | {cycle.edge_weight:g} "
-        f"| {stage.crop}x{stage.crop} | {stage.batch} | {stage.clips} | {stage.segments * stage.windows} | {stage.windows} | {stage.steps} |"
-        for cycle, stage in recipe.stages
-    )
+    rows = []
+    for cycle, stage in recipe.stages:
+        columns = (
+            recipe.cycles.index(cycle) + 1,
+            cycle.learning_rate,
+            cycle.edge_weight,
+            f"{stage.crop}x{stage.crop}",
+            stage.batch,
+            stage.clips,
+            stage.segments * stage.windows,
+            stage.windows,
+            stage.steps,
+        )
+        rows.append(f"| {' | '.join(str(column) for column in columns)} |")
+    return "\n".join(rows)
 
 
 def _speed_rows(errors: CornerErrors) -> str:
