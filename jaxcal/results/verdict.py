@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
-from jaxcal.results.coverage import coverage
+from jaxcal.results.coverage import coverage, least_kept
 from jaxcal.results.parameters import camera_estimates, sigma_of, timeshift_estimate
 from jaxcal.results.target_bias import target_bias
 from jaxcal.targets import Target
@@ -22,6 +22,7 @@ _TARGET_BIAS = 0.4  # share of the corner noise that is the same in every frame
 _FOCAL_SIGMA = (0.005, 0.03)  # relative
 _COVERAGE = (0.5, 0.15)
 _INLIERS = (0.9, 0.5)
+_INLIERS_OF_CELL = 0.6
 _FRAMES = (10.0, 3.0)
 _ROTATION_SIGMA_DEG = (0.2, 2.0)
 _TRANSLATION_SIGMA_M = (0.01, 0.1)
@@ -182,6 +183,17 @@ def _residual_checks(camera: CameraCalibration) -> Iterator[Check]:
         f"{camera.name} had many corners rejected as outliers" if total else f"{camera.name} contributed no corner",
         "Check that target.yaml describes the board in the pictures, and that the detections sit on the corners.",
     )
+    worst = least_kept(camera)
+    if np.isfinite(worst):
+        yield Check(
+            camera.name,
+            "corners kept, worst place",
+            f"{100.0 * worst:.0f} %",
+            f"over {100.0 * _INLIERS_OF_CELL:.0f} %",
+            "usable" if worst < _INLIERS_OF_CELL else "good",
+            f"{camera.name} lost {100.0 * (1.0 - worst):.0f} % of the corners in one part of its image as outliers",
+            "Corners rejected in one place (red in the coverage) mean a lens model too simple: choose a richer one.",
+        )
 
 
 def _target_checks(camera: CameraCalibration, target: Target) -> Iterator[Check]:

@@ -70,13 +70,15 @@ def _coverage_picture(camera: CameraCalibration, prefix: str) -> Picture:
         axes.add_patch(Rectangle(corner, width / across, height / down, facecolor=WARN, edgecolor="none", alpha=0.22))
     x, y = camera.detections.pixels[camera.used].T
     axes.plot(x, y, ".", markersize=1.6, color=POINT, alpha=_faintness(2 * len(x)), rasterized=True)
+    rejected = camera.detections.pixels[~camera.inlier]
+    axes.plot(*rejected.T, ".", markersize=2.0, color=REJECTED, alpha=_faintness(len(rejected)), rasterized=True)
     return Picture(
         "Coverage",
         to_svg(figure, prefix),
-        f"Every corner used ({len(x)}), over the image. Tinted cells saw none: {100 * coverage(camera):.0f} % of the "
-        "cells are covered.",
-        "points all over the image, into its edges and corners.",
-        "record more views with the target in the tinted places; distortion there is extrapolated.",
+        f"Every corner used ({len(x)}), rejected ones in red. Tinted cells hold none: {100 * coverage(camera):.0f} % "
+        "of the cells are covered.",
+        "points all over the image, into its edges; red ones few and scattered.",
+        "record the target in the tinted places, where distortion is extrapolated; red edges need a richer lens model.",
     )
 
 
