@@ -22,6 +22,8 @@ _MIN_PREDICTED = 0.6  # enough where the place says which tag to expect
 _MIN_CONTRAST = 12.0  # grey levels between black border and white bits
 _MIN_EDGE_PX = 8.0
 _ENOUGH_TAGS = 4
+# An image is speckled where more than this share of pixels differs by so much from their neighbours' median.
+_SPECKLE_GREY, _SPECKLE_SHARE = 50, 0.005
 _MAX_ROUNDS = 12
 
 
@@ -54,8 +56,8 @@ def find_aprilgrid(image: np.ndarray, target: AprilGrid) -> tuple[np.ndarray, np
     refined on the original image and kept when a homography of their neighbours agrees.
     """
     best = _NO_TAGS
-    for smooth, quads in _attempts(image):
-        tags = _complete(smooth, _decode(smooth, quads, target), target)
+    for readable, quads in _attempts(image):
+        tags = _complete(readable, _decode(readable, quads, target), target)
         if len(tags) > len(best):
             best = tags
         if len(best) >= min(_ENOUGH_TAGS, target.rows * target.cols):
@@ -68,18 +70,23 @@ def find_aprilgrid(image: np.ndarray, target: AprilGrid) -> tuple[np.ndarray, np
 
 def _attempts(image: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """(image to read codes from, candidate quadrilaterals (Q, 4, 2)), the most fruitful preparation first."""
-    grow = cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3))
     calm = cv2.medianBlur(image, 3)
-    # Kalibr's grid has black squares between the tags. Where they touch a tag its outline is no quadrilateral;
-    # growing the white parts them, and takes one pixel off each side.
-    yield calm, _widen(_quads(cv2.dilate(calm, grow)), 1.0)
-    yield calm, _quads(calm)
-    calmer = cv2.medianBlur(image, 5)
-    yield calmer, _widen(_quads(cv2.dilate(calmer, grow)), 1.0)
-    double = cv2.resize(calm, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC)
-    yield calm, (_widen(_quads(cv2.dilate(double, grow)), 1.0) + 0.5) / 2.0 - 0.5
-    inverted = 255 - calm
-    yield inverted, _widen(_quads(cv2.dilate(inverted, grow)), 1.0)
+    speckled = np.mean(cv2.absdiff(image, calm) > _SPECKLE_GREY) > _SPECKLE_SHARE  # event frames are
+    first, second = (calm, image) if speckled else (image, calm)
+    yield image, _parted_quads(first)
+    double = cv2.resize(first, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC)
+    yield image, (_parted_quads(double) + 0.5) / 2.0 - 0.5
+    yield image, _parted_quads(second)
+    yield 255 - image, _parted_quads(255 - first)
+
+
+def _parted_quads(image: np.ndarray) -> np.ndarray:
+    """Quadrilaterals of tags that black squares touch at their corners, as in Kalibr's grid.
+
+    Growing the white parts them from the squares, and takes one pixel off each side.
+    """
+    grown = cv2.dilate(image, cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3)))
+    return _widen(_quads(grown), 1.0)
 
 
 def _quads(image: np.ndarray) -> np.ndarray:
@@ -251,7 +258,8 @@ def _consistent(image: np.ndarray, tags: _Tags, target: AprilGrid) -> _Tags:
     refined, stayed = _refined(image, tags, target)
     corners = np.where(stayed[..., None], refined, tags.corners)
     floor = 0.2 * float(np.median(_edges(corners)))
-    agrees = agreeing_corners(_board(target)[tags.ids].reshape(-1, 2), corners.reshape(-1, 2), floor_px=floor)
+    board, size = _board(target)[tags.ids].reshape(-1, 2), (image.shape[1], image.shape[0])
+    agrees = agreeing_corners(board, corners.reshape(-1, 2), size, floor_px=floor)
     kept = agrees.reshape(-1, 4).sum(axis=1) >= 3
     return _Tags(tags.ids[kept], corners[kept])
 
@@ -263,5 +271,5 @@ def _checked_corners(image: np.ndarray, tags: _Tags, target: AprilGrid) -> tuple
     refined, stayed = _refined(image, tags, target)
     point = np.concatenate([target.tag_points(int(tag)) for tag in tags.ids])
     point, pixels = point[stayed.ravel()], refined[stayed]
-    keep = agreeing_corners(_board(target)[tags.ids][stayed], pixels)
+    keep = agreeing_corners(_board(target)[tags.ids][stayed], pixels, (image.shape[1], image.shape[0]))
     return point[keep], pixels[keep]

@@ -13,6 +13,7 @@ from jaxcal.targets import Checkerboard
 # without a board and found no board more, in real images and in noise of 30 grey levels.
 _FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE
 _MAX_HALF_WINDOW = 10
+_ENOUGH_ALTERNATE = 0.8
 _REACH = 0.4  # of the distance to the nearest corner
 
 
@@ -34,24 +35,46 @@ def find_checkerboard(image: np.ndarray, target: Checkerboard) -> tuple[np.ndarr
     corners = grid.reshape(-1, 2)
     refined, trusted = refine_corners(image, corners, _half_windows(grid).ravel())
     point = np.flatnonzero(trusted)
-    keep = agreeing_corners(target.points[point, :2], refined[point])
+    keep = agreeing_corners(target.points[point, :2], refined[point], (image.shape[1], image.shape[0]))
     return point[keep], refined[point[keep]]
 
 
 def _find(image: np.ndarray, target: Checkerboard) -> np.ndarray | None:
     """The board's corners as a grid (rows, cols, 2), in any orientation; None where there is no board."""
-    for prepared, scale in _attempts(image):
+    for prepared in _attempts(image):
         found, corners = cv2.findChessboardCornersSB(prepared, (target.cols, target.rows), flags=_FLAGS)
         if found:
-            pixels = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
-            return pixels.reshape(target.rows, target.cols, 2)
+            grid = np.asarray(corners, np.float64).reshape(target.rows, target.cols, 2)
+            if _colours_alternate(prepared, grid):
+                return grid
     return None
 
 
-def _attempts(image: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
-    """(prepared image, its scale), the most fruitful first."""
-    yield image, 1.0
-    yield cv2.createCLAHE(clipLimit=4.0, tileGridSize=(4, 4)).apply(cv2.GaussianBlur(image, (0, 0), 1.5)), 1.0
+def _colours_alternate(image: np.ndarray, grid: np.ndarray) -> bool:
+    """Whether opposite squares at a corner are alike and neighbours differ, at nearly all corners.
+
+    Boards of three rows are sometimes found one square off, with their outline among the corners.
+    """
+    along, up = np.gradient(grid, axis=1) * 0.3, np.gradient(grid, axis=0) * 0.3
+    squares = np.stack([grid + along + up, grid - along - up, grid + along - up, grid - along + up])
+    grey = _grey_at(image, squares)
+    one, other = grey[:2], grey[2:]
+    alternate = (one.max(axis=0) < other.min(axis=0)) | (one.min(axis=0) > other.max(axis=0))
+    return bool(alternate.mean() > _ENOUGH_ALTERNATE)
+
+
+def _grey_at(image: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Grey levels (...) of a slightly blurred image at pixels (..., 2)."""
+    u, v = np.moveaxis(places.reshape(-1, 1, 2).astype(np.float32), -1, 0)
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.5)
+    grey = cv2.remap(smooth, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return grey.reshape(places.shape[:-1]).astype(np.float64)
+
+
+def _attempts(image: np.ndarray) -> Iterator[np.ndarray]:
+    """The image, prepared in several ways, the most fruitful first."""
+    yield image
+    yield cv2.createCLAHE(clipLimit=4.0, tileGridSize=(4, 4)).apply(cv2.GaussianBlur(image, (0, 0), 1.5))
 
 
 def _canonical(image: np.ndarray, grid: np.ndarray) -> np.ndarray:
@@ -82,9 +105,7 @@ def _mean_directions(grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _lower_left_is_black(image: np.ndarray, grid: np.ndarray) -> bool:
     """Whether the square outside the first corner is black: all squares between the corners are asked."""
     centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4.0
-    smooth = cv2.GaussianBlur(image, (0, 0), 1.5)
-    u, v = np.moveaxis(centres.astype(np.float32), -1, 0)
-    grey = cv2.remap(smooth, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
+    grey = _grey_at(image, centres)
     # The square between the first four corners touches the outer one at a corner, so it has the same colour.
     same = np.indices(grey.shape).sum(axis=0) % 2 == 0
     return bool(grey[same].mean() < grey[~same].mean())
