@@ -24,7 +24,7 @@ def least_kept(camera: CameraCalibration) -> float:
 
     Rejection that concentrates in one place of the image is no matter of chance: the lens model does not hold there.
     """
-    seen = _counts(camera, np.isfinite(camera.residuals_px).all(axis=1))
+    seen = _counts(camera, np.asarray(np.isfinite(camera.residuals_px).all(axis=1)))
     enough = seen >= _FEWEST_FOR_SHARE
     return float(np.min(corner_counts(camera)[enough] / seen[enough], initial=1.0)) if enough.any() else float("nan")
 
