@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 _SIGMAS = 4.0
 _SOFT_PX = 0.5  # residuals beyond this count by their length, not by its square
-_MAX_FITS = 25
+_MAX_FITS = 60
 # 1-sigma of what few corners cannot tell: radial distortion at the grid's farthest corner, and the centre of
 # distortion as a fraction of that corner's distance. A deviation of one sigma counts as much as a pixel.
 _PRIOR_SIGMAS = np.array([0.5, 0.5, 0.2, 0.2])
