@@ -16,8 +16,8 @@ _PIXEL_VARIANCE = 1.0 / 12.0
 # Gauss-Hermite nodes for a standard normal.
 _NODES = ((-np.sqrt(3.0), 1.0 / 6.0), (0.0, 2.0 / 3.0), (np.sqrt(3.0), 1.0 / 6.0))
 _FAR = 1e6  # metres; where the background ends
-_HORIZON_PX = 5.0
-_COARSE_PX = 8
+_HORIZON_PX = 5.0  # rays that close to the plane's horizon see the background
+_COARSE_PX = 8  # spacing of the grid from which rays are interpolated
 _NEWTON_STEPS = 3
 
 
@@ -72,7 +72,7 @@ def _lines(inner: np.ndarray) -> Lines:
 
 
 def pixel_rays(model: CameraModel, image_size: tuple[int, int]) -> PixelRays:
-    """Rays of all pixels of a camera, row by row. Pixels outside the lens' domain look backwards, so see background.
+    """Rays of all pixels of a camera, row by row. Pixels outside the lens' domain get a zero ray: background.
 
     The model's own unprojection serves a coarse grid; rays interpolated from it are refined by Newton's method.
     """
@@ -104,15 +104,20 @@ def _refine_rays(model: CameraModel, pixels: Float[Array, "n 2"], start: Float[A
             ray = ray / jnp.linalg.norm(ray)
         found = jnp.linalg.norm(model.project(ray) - pixel) < 1e-4
         valid = found & model.is_valid(ray)
-        return jnp.where(valid, ray, jnp.array([0.0, 0.0, -1.0])), jnp.where(valid, inverse(ray), 1e-3)
+        return jnp.where(valid, ray, 0.0), jnp.where(valid, inverse(ray), 0.0)
 
     rays, per_pixel = jax.vmap(refined)(pixels, start)
     return PixelRays(rays.T.astype(jnp.float32), jnp.moveaxis(per_pixel, 0, -1).astype(jnp.float32))
 
 
 def plane_from_camera(T_cam_target: np.ndarray) -> np.ndarray:
-    """Matrices (K, 3, 3) that map a ray to (X, Y, 1) / depth on the target plane, for poses (K, 4, 4)."""
-    return np.linalg.inv(T_cam_target[:, :3][:, :, [0, 1, 3]]).astype(np.float32)
+    """Matrices (K, 3, 3) that map a ray to (X, Y, 1) / depth on the target plane, for poses (K, 4, 4).
+
+    Zero for a camera behind the board, which sees the background only.
+    """
+    camera_from_plane = T_cam_target[:, :3][:, :, [0, 1, 3]]
+    from_the_front = np.linalg.det(camera_from_plane) < 0.0
+    return (np.linalg.inv(camera_from_plane) * from_the_front[:, None, None]).astype(np.float32)
 
 
 class _Footprint(NamedTuple):
@@ -191,7 +196,7 @@ def _shade(
     return total
 
 
-def blur_px(psf_sigma_px: float | Array) -> float:
+def blur_px(psf_sigma_px: float) -> float:
     """Standard deviation of lens blur and pixel area together, px."""
     return float(np.sqrt(psf_sigma_px**2 + _PIXEL_VARIANCE))
 

@@ -130,6 +130,32 @@ def test_nothing_of_the_board_appears_beyond_the_horizon():
     assert np.mean(np.abs(image - BACKGROUND) > 0.01) < 0.4
 
 
+def test_the_back_of_the_board_is_plain():
+    target = TARGETS["checkerboard"]
+    front = _pose(target, [0.2, 0.1, 0.0])
+    centre = target.points.mean(axis=0)
+    behind = front @ _shift(centre) @ _transform([0.0, np.pi, 0.0], [0.0, 0.0, 0.0]) @ _shift(-centre)
+    assert np.ptp(_image("pinhole-radtan", target, front)) > 0.8
+    np.testing.assert_allclose(_image("pinhole-radtan", target, behind), BACKGROUND, atol=1e-6)
+    # Measurements agree: nothing is seen from behind.
+    _, real = project_points(MODELS["pinhole-radtan"], jnp.asarray(behind[None]), jnp.asarray(target.points))
+    assert not np.any(real)
+
+
+def test_pixels_that_no_ray_reaches_show_the_background():
+    # With this distortion the image ends at a radius of 0.61 focal lengths; beyond it there are no rays.
+    model = PinholeRadtan.create([100.0, 100.0, 79.5, 59.5], [-0.4, 0.0, 0.0, 0.0])
+    rays = pixel_rays(model, (160, 120))
+    dark = np.all(np.asarray(rays.ray) == 0.0, axis=0)
+    assert 0.05 < dark.mean() < 0.5
+    assert np.all(np.isfinite(np.asarray(rays.per_pixel)))
+    target = TARGETS["checkerboard"]
+    matrices = jnp.asarray(plane_from_camera(_pose(target, [0.1, 0.0, 0.0], 0.5)[None]))
+    image = np.asarray(render(rays, matrices, surface_of(pattern_of(target)), blur_px(PSF))[0])
+    np.testing.assert_allclose(image[dark], BACKGROUND, atol=1e-6)
+    assert np.ptp(image[~dark]) > 0.8
+
+
 def test_stock_detectors_know_the_patterns():
     board = Checkerboard(5, 6, 0.1)
     image = np.clip(255 * _image("pinhole-radtan", board, _pose(board, [0.1, 0.2, 0.05])), 0, 255).astype(np.uint8)
