@@ -39,6 +39,11 @@ def model_card(path: Path, network: FoldedFireNet, recipe: Recipe, seconds: floa
     """Markdown: what the network is, what it was trained on and how, what it reaches, its licence and checksum."""
     data, parameters = recipe.data, sum(tensor.numel() for tensor in network.parameters())
     reconstructed, sharp = evaluation.reconstructed, evaluation.sharp
+    stages = "\n".join(
+        f"- {stage.crop}x{stage.crop} crops, batch {stage.batch}: {stage.clips} clips of {stage.segments} x "
+        f"{stage.windows} windows, one step per {stage.windows} windows, {stage.steps} steps"
+        for stage in recipe.stages
+    )
     return f"""# {path.stem}
 
 Reconstructs grey images of calibration boards from events. `reconstruction.load_network("{path.stem}")`.
@@ -68,13 +73,10 @@ No recordings, no third-party images.
 
 `python -m reconstruction.training --output models/`, {seconds / 60:.0f} minutes of training with one thread
 on a shared machine with two CPU cores.
-Loss: L1 of the image, weighted towards edges in the later cycle, + {recipe.gradient_weight} x L1 of its differences.
-AdamW, the learning rate falls linearly to zero in each cycle; gradient norm clipped at {recipe.clip_norm}, weights
-averaged (decay {recipe.average_decay}); bfloat16; the state is carried from step to step within a clip.
+Loss: L1 of the image + {recipe.gradient_weight} x L1 of its differences. AdamW {recipe.learning_rate}, linear decay to
+zero, gradient norm clipped at {recipe.clip_norm}, weights averaged (decay {recipe.average_decay}); bfloat16.
 
-| cycle | learning rate | edge weight | crops | batch | clips | windows per clip | windows per step | steps |
-|---|---|---|---|---|---|---|---|---|
-{_stage_rows(recipe)}
+{stages}
 
 Recipe fingerprint `{fingerprint(recipe)}`; all settings are in the file's metadata.
 
@@ -100,24 +102,6 @@ Detection ratio {evaluation.detection_ratio:.3f}. By speed of the corner:
 
 def _settings(network: FoldedFireNet) -> str:
     return ", ".join(f"{name} {value}" for name, value in network.settings.items())
-
-
-def _stage_rows(recipe: Recipe) -> str:
-    rows = []
-    for cycle, stage in recipe.stages:
-        columns = (
-            recipe.cycles.index(cycle) + 1,
-            cycle.learning_rate,
-            cycle.edge_weight,
-            f"{stage.crop}x{stage.crop}",
-            stage.batch,
-            stage.clips,
-            stage.segments * stage.windows,
-            stage.windows,
-            stage.steps,
-        )
-        rows.append(f"| {' | '.join(str(column) for column in columns)} |")
-    return "\n".join(rows)
 
 
 def _speed_rows(errors: CornerErrors) -> str:

@@ -9,14 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 
 from jaxcal.progress import Progress, no_progress
 from reconstruction.networks import FoldedFireNet
 from reconstruction.networks.base import State
 from reconstruction.training.data import Dataset
-from reconstruction.training.recipe import Cycle, Recipe, Stage, fingerprint
+from reconstruction.training.recipe import Recipe, Stage, fingerprint
 
 logger = logging.getLogger(__name__)
 
@@ -53,9 +52,9 @@ def train(
     saved = begun = time.monotonic()
     before = run.seconds
     while run.stage < len(recipe.stages):
-        cycle, stage = recipe.stages[run.stage]
+        stage = recipe.stages[run.stage]
         while run.clip < stage.clips:
-            _train_on_clip(run, recipe, cycle, stage, dataset)
+            _train_on_clip(run, recipe, stage, dataset)
             run.clip += 1
             run.seconds = before + time.monotonic() - begun
             progress("train", run.step, recipe.steps)
@@ -73,64 +72,56 @@ def _start(recipe: Recipe) -> Run:
     network = FoldedFireNet(num_bins=recipe.num_bins, channels=recipe.channels)
     network = network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     optimiser = torch.optim.AdamW(
-        network.parameters(), lr=recipe.learning_rate(0), weight_decay=recipe.weight_decay, betas=(0.9, 0.99)
+        network.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay, betas=(0.9, 0.99)
     )
     return Run(network, copy.deepcopy(network), optimiser)
 
 
-def _train_on_clip(run: Run, recipe: Recipe, cycle: Cycle, stage: Stage, dataset: Dataset) -> None:
+def _train_on_clip(run: Run, recipe: Recipe, stage: Stage, dataset: Dataset) -> None:
     rng = np.random.default_rng([recipe.seed, run.stage, run.clip])
     voxels, targets = dataset.clip(rng, stage)
     state: State | None = None
     for segment in range(stage.segments):
         part = slice(segment * stage.windows, (segment + 1) * stage.windows)
-        predicted, state = _unrolled(run.network, voxels[part], state)
-        counted = slice(stage.warm_up if segment == 0 else 0, None)
-        loss = image_loss(predicted[counted], targets[part][counted], recipe.gradient_weight, cycle.edge_weight)
+        loss, state = _segment_loss(
+            run.network, voxels[part], targets[part], state, stage.warm_up if segment == 0 else 0, recipe
+        )
         _optimise(run, recipe, loss)
         state = [tensor.detach() for tensor in state]
 
 
-def _unrolled(
-    network: FoldedFireNet, voxels: Float[torch.Tensor, "t b c h w"], state: State | None
-) -> tuple[Float[torch.Tensor, "t b 1 h w"], State]:
-    """The images of a segment's windows, and the state at its end."""
+def _segment_loss(
+    network: FoldedFireNet,
+    voxels: Float[torch.Tensor, "t b c h w"],
+    targets: Float[torch.Tensor, "t b 1 h w"],
+    state: State | None,
+    warm_up: int,
+    recipe: Recipe,
+) -> tuple[Float[torch.Tensor, ""], State]:
+    """Mean loss over the windows after `warm_up`, and the state at the segment's end."""
     images = []
     with torch.autocast("cpu", torch.bfloat16):
         for grid in voxels:
             image, state = network(grid.contiguous(memory_format=torch.channels_last), state)
             images.append(image)
     assert state is not None
-    return torch.stack(images).float(), state
+    predicted = torch.stack(images[warm_up:]).float()
+    return image_loss(predicted, targets[warm_up:], recipe.gradient_weight), state
 
 
 def image_loss(
-    predicted: Float[torch.Tensor, "*n h w"],
-    target: Float[torch.Tensor, "*n h w"],
-    gradient_weight: float,
-    edge_weight: float = 0.0,
+    predicted: Float[torch.Tensor, "*n h w"], target: Float[torch.Tensor, "*n h w"], gradient_weight: float
 ) -> Float[torch.Tensor, ""]:
-    """L1 error of the image, plus that of its differences between neighbours along rows and columns.
-
-    The error of a pixel is weighted by 1 + `edge_weight` x the largest change of the target to its neighbours.
-    """
+    """L1 error of the image, plus that of its differences between neighbours along rows and columns."""
     error = predicted - target
     differences = error.diff(dim=-1).abs().mean() + error.diff(dim=-2).abs().mean()
-    if edge_weight > 0:
-        error = error * (1.0 + edge_weight * _largest_change(target))
     return error.abs().mean() + gradient_weight * differences
 
 
-def _largest_change(image: Float[torch.Tensor, "*n h w"]) -> Float[torch.Tensor, "*n h w"]:
-    """For each pixel the largest absolute difference to its four neighbours."""
-    across, down = image.diff(dim=-1).abs(), image.diff(dim=-2).abs()
-    neighbours = F.pad(across, (0, 1)), F.pad(across, (1, 0)), F.pad(down, (0, 0, 0, 1)), F.pad(down, (0, 0, 1, 0))
-    return torch.stack(neighbours).amax(dim=0)
-
-
 def _optimise(run: Run, recipe: Recipe, loss: Float[torch.Tensor, ""]) -> None:
+    rise = min(1.0, (run.step + 1) / recipe.warm_up_steps)
     for group in run.optimiser.param_groups:
-        group["lr"] = recipe.learning_rate(run.step)
+        group["lr"] = recipe.learning_rate * rise * (1.0 - run.step / recipe.steps)
     run.optimiser.zero_grad(set_to_none=True)
     loss.backward()
     torch.nn.utils.clip_grad_norm_(run.network.parameters(), recipe.clip_norm)

@@ -40,43 +40,17 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Cycle:
-    """Stages over which the learning rate falls linearly from `learning_rate` to zero.
-
-    The loss of a pixel is weighted by 1 + `edge_weight` x the target's change to its neighbours: what counts in the end
-    is where edges lie, not how well a background is guessed that no event tells about.
-    """
-
-    stages: tuple[Stage, ...]
-    learning_rate: float
-    edge_weight: float = 0.0
-
-    @property
-    def steps(self) -> int:
-        return sum(stage.steps for stage in self.stages)
-
-
-@dataclass(frozen=True)
 class Recipe:
     """All of it. `gradient_weight` multiplies the L1 error of the image's differences, beside that of the image."""
 
     data: DataRecipe = DataRecipe()
-    cycles: tuple[Cycle, ...] = (
-        Cycle(
-            stages=(
-                Stage(crop=64, windows=10, segments=1, batch=4, clips=2000),
-                Stage(crop=96, windows=12, segments=4, batch=2, clips=450),
-            ),
-            learning_rate=2e-3,
-        ),
-        Cycle(
-            stages=(Stage(crop=96, windows=12, segments=4, batch=2, clips=250),),
-            learning_rate=1.2e-3,
-            edge_weight=10.0,
-        ),
+    stages: tuple[Stage, ...] = (
+        Stage(crop=64, windows=10, segments=1, batch=4, clips=2000),
+        Stage(crop=96, windows=12, segments=4, batch=2, clips=450),
     )
     channels: int = 32
     num_bins: int = 5
+    learning_rate: float = 2e-3
     warm_up_steps: int = 50
     weight_decay: float = 1e-4
     gradient_weight: float = 0.5
@@ -86,22 +60,7 @@ class Recipe:
 
     @property
     def steps(self) -> int:
-        return sum(cycle.steps for cycle in self.cycles)
-
-    @property
-    def stages(self) -> tuple[tuple[Cycle, Stage], ...]:
-        """All stages in order, each with the cycle that it belongs to."""
-        return tuple((cycle, stage) for cycle in self.cycles for stage in cycle.stages)
-
-    def learning_rate(self, step: int) -> float:
-        """At optimiser step `step` of the whole training."""
-        first = 0
-        for cycle in self.cycles:
-            if step < first + cycle.steps:
-                rise = min(1.0, (step + 1) / self.warm_up_steps)
-                return cycle.learning_rate * rise * (1.0 - (step - first) / cycle.steps)
-            first += cycle.steps
-        return 0.0
+        return sum(stage.steps for stage in self.stages)
 
     def describe(self) -> str:
         """All settings as JSON, keys sorted: equal recipes give equal text."""

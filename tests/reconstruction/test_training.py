@@ -14,21 +14,14 @@ from reconstruction.training import loop
 from reconstruction.training.data import Dataset, load_or_generate
 from reconstruction.training.evaluate import CornerErrors, find_corners
 from reconstruction.training.motion import apply_homography, speed_profile
-from reconstruction.training.recipe import Cycle, DataRecipe, Recipe, Stage, fingerprint
+from reconstruction.training.recipe import DataRecipe, Recipe, Stage, fingerprint
 from reconstruction.training.sequences import BLACK, WHITE, evaluation_scene, training_scene, windows
 
 TINY = Recipe(
     data=DataRecipe(sequences=3, windows=8, size=32),
-    cycles=(
-        Cycle((Stage(crop=16, windows=4, segments=1, batch=2, clips=6),), learning_rate=2e-3),
-        Cycle(
-            (
-                Stage(crop=16, windows=4, segments=1, batch=2, clips=6),
-                Stage(crop=32, windows=4, segments=2, batch=1, clips=4),
-            ),
-            learning_rate=1e-3,
-            edge_weight=5.0,
-        ),
+    stages=(
+        Stage(crop=16, windows=4, segments=1, batch=2, clips=12),
+        Stage(crop=32, windows=4, segments=2, batch=1, clips=4),
     ),
     channels=4,
     warm_up_steps=2,
@@ -79,7 +72,7 @@ def test_an_interrupted_training_ends_as_an_unbroken_one(
 
 def test_a_checkpoint_of_another_recipe_is_not_continued(tiny_dataset: Dataset, tmp_path: Path):
     _train(TINY, tiny_dataset, tmp_path / "run.pt")
-    other = Recipe(data=TINY.data, cycles=TINY.cycles[:1], channels=4, seed=9)
+    other = Recipe(data=TINY.data, stages=TINY.stages[:1], channels=4, seed=9)
     restarted = _train(other, tiny_dataset, tmp_path / "run.pt")
     fresh = _train(other, tiny_dataset, tmp_path / "fresh.pt")
     assert all(torch.equal(restarted[name], fresh[name]) for name in fresh)
@@ -87,12 +80,12 @@ def test_a_checkpoint_of_another_recipe_is_not_continued(tiny_dataset: Dataset, 
 
 def test_training_reduces_the_loss_on_what_it_sees(tiny_dataset: Dataset, tmp_path: Path):
     stage = Stage(crop=32, windows=8, segments=1, batch=2, clips=60)
-    recipe = Recipe(data=TINY.data, cycles=(Cycle((stage,), learning_rate=5e-3),), channels=16, warm_up_steps=2)
+    recipe = Recipe(data=TINY.data, stages=(stage,), channels=16, warm_up_steps=2, learning_rate=5e-3)
     voxels, targets = tiny_dataset.clip(np.random.default_rng(0), stage)
 
     def loss(network: FoldedFireNet) -> float:
         with torch.no_grad():
-            return loop.image_loss(loop._unrolled(network, voxels, None)[0][2:], targets[2:], 0.5).item()
+            return loop._segment_loss(network, voxels, targets, None, 2, recipe)[0].item()
 
     before = loss(loop._start(recipe).network)
     trained, _ = loop.train(recipe, tiny_dataset, tmp_path / "run.pt")
@@ -129,27 +122,6 @@ def test_image_loss_is_zero_for_the_truth_and_counts_edges():
     assert loop.image_loss(target, target, 0.5).item() == 0.0
     assert loop.image_loss(target + offset, target, 0.5).item() == pytest.approx(0.1)
     assert loop.image_loss(target + stripes, target, 0.5).item() == pytest.approx(0.1 + 0.5 * 0.2)
-
-
-def test_edge_weight_counts_errors_where_the_target_changes():
-    target = torch.zeros(1, 4, 6)
-    target[..., 3:] = 1.0
-    at_edge, away = torch.zeros(1, 4, 6), torch.zeros(1, 4, 6)
-    at_edge[..., 2] = away[..., 0] = 0.1
-    plain = loop.image_loss(target + away, target, 0.0).item()
-    assert loop.image_loss(target + away, target, 0.0, 8.0).item() == pytest.approx(plain)
-    assert loop.image_loss(target + at_edge, target, 0.0, 8.0).item() == pytest.approx(9 * plain)
-
-
-def test_learning_rate_falls_to_zero_in_each_cycle():
-    rates = [TINY.learning_rate(step) for step in range(TINY.steps)]
-    assert rates[1] == pytest.approx(2e-3 * (1 - 1 / 6))  # the rise over two steps is over
-    assert rates[0] == pytest.approx(1e-3)
-    assert rates[6] == pytest.approx(1e-3)
-    assert (np.diff(rates[1:6]) < 0).all()
-    assert (np.diff(rates[6:]) < 0).all()
-    assert rates[-1] == pytest.approx(1e-3 / 14)
-    assert TINY.learning_rate(TINY.steps) == 0.0
 
 
 @settings(deadline=None, max_examples=20)
