@@ -91,12 +91,12 @@ def spline_poses(state: RigState, data: VisionData, start: Array, dt: Array, ord
 class FrameEquations(eqx.Module):
     """Gauss-Newton contributions of frames, before they are added up: window (k x 6), and shared (q = n + 7) parts."""
 
-    window: Float[Array, "F k 6 k 6"]
-    cross: Float[Array, "F k 6 q"]
-    shared: Float[Array, "F q q"]
-    gradient_window: Float[Array, "F k 6"]
-    gradient_shared: Float[Array, "F q"]
-    cost: Float[Array, " F"]
+    window: Float[Array, "*F k 6 k 6"]
+    cross: Float[Array, "*F k 6 q"]
+    shared: Float[Array, "*F q q"]
+    gradient_window: Float[Array, "*F k 6"]
+    gradient_shared: Float[Array, "*F q"]
+    cost: Float[Array, "*F"]
 
 
 def project_frame(
