@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxcal.calibration import solving
 from jaxcal.calibration.assemble import CameraFrames
+from jaxcal.calibration.redundancy import view_features
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
 from jaxcal.targets import Target
@@ -111,12 +112,7 @@ def spread_views(frames: CameraFrames, count: int) -> np.ndarray:
     by index, so that it is deterministic)."""
     if len(frames.frames) <= count:
         return np.arange(len(frames.frames))
-    scale = float(max(frames.detections.image_size))
-    features = np.empty((len(frames.frames), 6))
-    for f, (pixels, seen) in enumerate(zip(frames.pixels, frames.seen, strict=True)):
-        xy = pixels[seen] / scale
-        spread = np.cov(xy.T)
-        features[f] = [*xy.mean(axis=0), *np.sqrt(np.maximum(np.diag(spread), 0)), spread[0, 1] * 10, seen.mean()]
+    features = view_features(frames)
     chosen = [int(np.argmax(frames.seen.sum(axis=1)))]
     distance = np.full(len(features), np.inf)
     while len(chosen) < count:

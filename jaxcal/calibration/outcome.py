@@ -19,7 +19,20 @@ def chain_covariance_and_sentences(
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Covariance of shared parameters, marginal covariance of the chain, sentences on what is unobserved."""
     labels = uncertainty.labels_of(names, fit.problem.layout, num_intrinsics)
-    return uncertainty.shared_covariance(fit.result.equations, np.asarray(fit.problem.free), labels)
+    covariance, chain, sentences = uncertainty.shared_covariance(
+        fit.result.equations, np.asarray(fit.problem.free), labels
+    )
+    # Views that repeat each other's errors were given relative weights; what they are worth together is less still.
+    inflation = max(r.inflation for r in fit.redundancy)
+    worst = max(range(len(names)), key=lambda c: fit.redundancy[c].inflation)
+    if inflation > 1.0:
+        sentences.append(
+            f"{names[worst]}: the errors of views that look alike agree (correlation "
+            f"{fit.redundancy[worst].correlation:.2f}), so they are not noise: the lens model is too lean, the board "
+            "not flat, or the detector biased. Such views count less, and all sigmas were raised "
+            f"{np.sqrt(inflation):.1f}-fold."
+        )
+    return covariance * inflation, chain * inflation, sentences
 
 
 def calibration_from(

@@ -6,6 +6,8 @@ import numpy as np
 
 # A good corner errs by more than this many sigma (2-D) once in 25 000.
 _REJECT_SIGMAS = 4.5
+# How much noisier than its camera a frame may be, and still take part.
+_LARGEST_FRAME_NOISE = 4.0
 # Corner detectors are never better than this; keeps noise-free input from demanding the impossible (px).
 _SMALLEST_SIGMA = 1e-4
 
@@ -25,9 +27,16 @@ def rms_sigma(error: np.ndarray, inlier: np.ndarray, parameters: float) -> float
 
 
 def inliers(error: np.ndarray, seen: np.ndarray, sigma: float) -> np.ndarray:
-    """Corners (F, N) within the rejection threshold; a frame that loses most of its corners is left out whole."""
+    """Corners (F, N) within the rejection threshold; a frame that loses most of its corners is left out whole.
+
+    The noise is that of the frame, where it is larger than the camera's (up to a limit): corners of a steep or distant
+    board are less sharp without being wrong, and leaving them out would take away the image's rim.
+    """
     distance = np.linalg.norm(error, axis=-1)
-    good = seen & (distance < _REJECT_SIGMAS * sigma)
+    median = np.nanmedian(np.where(seen.any(axis=1, keepdims=True), np.where(seen, distance, np.nan), 0.0), axis=1)
+    of_frame = median / np.sqrt(2.0 * np.log(2.0))
+    local = np.clip(of_frame, sigma, _LARGEST_FRAME_NOISE * sigma)[:, None]
+    good = seen & (distance < _REJECT_SIGMAS * local)
     lost = good.sum(axis=1) < 0.5 * seen.sum(axis=1)
     return good & ~lost[:, None]
 

@@ -1,4 +1,4 @@
-"""Solving with unknown corner noise and outliers: robust loss first, then rejection, then plain least squares."""
+"""Solving with unknown corner noise, redundant views and outliers: robust loss, rejection, then plain least squares."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -11,6 +11,7 @@ import numpy as np
 from jaxcal.calibration import outliers
 from jaxcal.calibration.assemble import CameraFrames, masked_weights, split_groups, stack_groups
 from jaxcal.calibration.problem import RigProblem
+from jaxcal.calibration.redundancy import Redundancy, measure_redundancy
 from jaxcal.calibration.state import RigState
 from jaxcal.errors import CalibrationError
 from jaxcal.estimation import SolveResult, solve
@@ -19,7 +20,7 @@ from jaxcal.progress import Progress
 logger = logging.getLogger(__name__)
 
 _HUBER_SIGMAS = 2.5
-ROUNDS = 4
+ROUNDS = 5
 
 # Adapts a problem to the residuals found so far (re-weights its IMU, say).
 Reweigh = Callable[[RigProblem, RigState], RigProblem]
@@ -34,6 +35,7 @@ class RobustFit:
     errors: list[np.ndarray]
     kept: list[np.ndarray]
     sigmas: list[float]
+    redundancy: list[Redundancy]
 
     @property
     def state(self) -> RigState:
@@ -60,20 +62,21 @@ def robust_fit(
 ) -> RobustFit:
     """Solve, estimating the corner noise of each camera and leaving outliers out.
 
-    Rounds: Huber's loss with `first_sigmas`; Huber's loss with the noise found (median); plain least squares on the
-    inliers; the same with the noise of the inliers (root mean square). `usable[c]` (F,) are the frames that may take
-    part; `pose_parameters[c]` how many parameters of the trajectory a camera's corners pay for, for the degrees of
+    Rounds: Huber's loss with `first_sigmas`; Huber's loss with the noise found (median); the same with each view
+    weighted by what it adds (`redundancy`); plain least squares on the inliers; the same with the noise of the inliers
+    (root mean square). `usable[c]` (F,) are the frames that may take part; `pose_parameters[c]` how many parameters of the trajectory a camera's corners pay for, for the degrees of
     freedom.
     """
     layout = problem.layout
     seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]
     kept, sigmas = seen, list(first_sigmas)
+    redundancy = [Redundancy(np.ones(len(s)), 1.0, 0.0) for s in seen]
     result: SolveResult | None = None
     errors: list[np.ndarray] = []
     for stage in range(ROUNDS):
         progress("optimise", stage, ROUNDS)
-        width = _HUBER_SIGMAS if stage < 2 else np.inf
-        problem = _with_weights(problem, cameras, kept, sigmas, width)
+        width = _HUBER_SIGMAS if stage < 3 else np.inf
+        problem = _with_weights(problem, cameras, kept, sigmas, redundancy, width)
         if reweigh is not None and result is not None:
             problem = reweigh(problem, state)
         result = solve(problem, state, max_steps=max_steps)
@@ -84,11 +87,15 @@ def robust_fit(
                 "the optimisation diverged: the residuals are not finite. Check for frames with a wrong board, and "
                 "that the camera models suit the lenses."
             )
-        if stage < 2:
+        if stage < 3:
             sigmas = [outliers.robust_sigma(e, s) for e, s in zip(errors, kept, strict=True)]
         if stage == 1:
+            redundancy = [
+                measure_redundancy(*parts) for parts in zip(cameras, errors, seen, sigmas, strict=True)
+            ]
+        if stage == 2:
             kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(errors, seen, sigmas, strict=True)]
-        if stage >= 2:
+        if stage >= 3:
             parameters = [n + p for n, p in zip(layout.sizes, pose_parameters, strict=True)]
             sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(errors, kept, parameters, strict=True)]
         logger.info(
@@ -100,7 +107,7 @@ def robust_fit(
         )
     progress("optimise", ROUNDS, ROUNDS)
     assert result is not None
-    return RobustFit(problem, result, errors, kept, sigmas)
+    return RobustFit(problem, result, errors, kept, sigmas, redundancy)
 
 
 def _with_weights(
@@ -108,9 +115,12 @@ def _with_weights(
     cameras: Sequence[CameraFrames],
     kept: Sequence[np.ndarray],
     sigmas: Sequence[float],
+    redundancy: Sequence[Redundancy],
     huber_width: float,
 ) -> RigProblem:
-    weights = masked_weights(cameras, [k / sigma**2 for k, sigma in zip(kept, sigmas, strict=True)])
+    weights = masked_weights(
+        cameras, [k * r.weights[:, None] / sigma**2 for k, sigma, r in zip(kept, sigmas, redundancy, strict=True)]
+    )
     stacked = stack_groups(problem.layout, weights)
     return eqx.tree_at(
         lambda p: [*[data.weight for data in p.corners], p.huber_width],

@@ -1,0 +1,95 @@
+"""How much a view repeats what other views have said already, judged by whether their residuals agree.
+
+Corner noise is independent from view to view, and then every view counts in full. What the model cannot explain (a
+lean lens model, a board that is not flat, a detector's bias) is the same in all views that look alike: a hundred of
+them say hardly more than one, yet outvote the few views that reach the image's rim. So the correlation of residuals
+in pairs of views that look alike is measured; where it is there, a view is weighted by the inverse of the number of
+views that it stands for (the design effect of clustered samples, Kish 1965, sec. 8.2).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxcal.calibration.assemble import CameraFrames
+
+# Views closer than this look alike (see `view_features`: 0.12 is 77 px of shift in a 640 px image).
+_ALIKE = 0.12
+_PAIRS = 4000
+_MOST_VIEWS = 3000
+# Correlations below this are taken for noise: independent corners in some thousand pairs stay well under it.
+_NEGLIGIBLE = 0.08
+# The share of views, the least repeated ones, that get full weight.
+_FULL_WEIGHT_QUANTILE = 0.98
+
+
+@dataclass(frozen=True)
+class Redundancy:
+    """`weights` (F,) in (0, 1], relative; `inflation` by which a covariance from these weights is too small;
+    `correlation` of residuals in views that look alike."""
+
+    weights: np.ndarray
+    inflation: float
+    correlation: float
+
+
+def view_features(frames: CameraFrames) -> np.ndarray:
+    """Where and how the board stands in each image (F, 6): centre, spread, shear in units of the image's longer side,
+    and the share of the board that is seen."""
+    scale = float(max(frames.detections.image_size))
+    features = np.empty((len(frames.frames), 6))
+    for f, (pixels, seen) in enumerate(zip(frames.pixels, frames.seen, strict=True)):
+        xy = pixels[seen] / scale
+        spread = np.cov(xy.T)
+        features[f] = [*xy.mean(axis=0), *np.sqrt(np.maximum(np.diag(spread), 0)), spread[0, 1] * 10, seen.mean()]
+    return features
+
+
+def measure_redundancy(frames: CameraFrames, errors: np.ndarray, usable: np.ndarray, sigma: float) -> Redundancy:
+    """Weights of the views of one camera from its reprojection errors (F, N, 2), px, with corner noise `sigma`.
+
+    `usable` (F, N) marks corners that take part. Deterministic.
+    """
+    count = len(errors)
+    even = Redundancy(np.ones(count), 1.0, 0.0)
+    if count < 20:
+        return even
+    features = view_features(frames)
+    # Outliers are shortened, so that they do not make up the correlation.
+    length = np.linalg.norm(errors, axis=-1, keepdims=True)
+    errors = np.where(usable[..., None], errors * np.minimum(1.0, 4.0 * sigma / np.maximum(length, 1e-12)), 0.0)
+    correlation = _correlation_of_look_alikes(features, errors, usable)
+    if correlation < _NEGLIGIBLE:
+        return even
+    weights = 1.0 / _stands_for(features)
+    full = float(np.quantile(weights, _FULL_WEIGHT_QUANTILE))
+    return Redundancy(np.minimum(weights / full, 1.0), 1.0 / full, correlation)
+
+
+def _correlation_of_look_alikes(features: np.ndarray, errors: np.ndarray, usable: np.ndarray) -> float:
+    """Correlation of the residuals of equal corners over pairs of views that look alike."""
+    rng = np.random.default_rng(0)
+    first, second = rng.integers(0, len(errors), size=(2, 60 * _PAIRS))
+    after = np.arange(len(errors) - 1)  # neighbours in time are often the most alike
+    first, second = np.concatenate([after, first]), np.concatenate([after + 1, second])
+    distance = np.linalg.norm(features[first] - features[second], axis=1)
+    pairs = np.flatnonzero((distance < _ALIKE) & (first != second))[:_PAIRS]
+    product, power = 0.0, 0.0
+    for chunk in np.array_split(pairs, max(len(pairs) // 500, 1)):
+        a, b = errors[first[chunk]], errors[second[chunk]]
+        both = (usable[first[chunk]] & usable[second[chunk]])[..., None]
+        product += float(np.sum(a * b * both))
+        power += float(np.sum(0.5 * (a**2 + b**2) * both))
+    return product / power if len(pairs) >= 10 and power > 0 else 0.0
+
+
+def _stands_for(features: np.ndarray) -> np.ndarray:
+    """How many views each one stands for, itself included (F,): look-alikes count by how alike they are."""
+    step = max(1, len(features) // _MOST_VIEWS)
+    others = features[::step]
+    total = np.empty(len(features))
+    for start in range(0, len(features), 500):
+        rows = features[start : start + 500]
+        distance = np.linalg.norm(rows[:, None] - others[None], axis=-1)
+        total[start : start + 500] = np.maximum(1.0 - distance / _ALIKE, 0.0).sum(axis=1) * step
+    return np.maximum(total, 1.0)
