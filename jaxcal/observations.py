@@ -1,7 +1,6 @@
 """The plain data types that travel between rooms, validated when they are made; numpy only."""
 
-import os
-import tempfile
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from jaxcal.atomic import write_bytes
 from jaxcal.errors import CalibrationError
 
 
@@ -23,8 +23,8 @@ def _strictly_increasing(name: str, timestamps_ns: np.ndarray) -> None:
         place = int(np.argmax(steps <= 0)) + 1
         kind = "duplicate" if steps[place - 1] == 0 else "out of order"
         raise CalibrationError(
-            f"{name}: timestamp {place} ({timestamps_ns[place]} ns) is {kind} (the one before is "
-            f"{timestamps_ns[place - 1]} ns). Timestamps must increase strictly: sort the recording and drop duplicates."
+            f"{name}: timestamp {place} ({timestamps_ns[place]} ns) is {kind} (the one before "
+            f"is {timestamps_ns[place - 1]} ns). Timestamps must increase strictly: sort the recording and drop duplicates."
         )
 
 
@@ -272,23 +272,16 @@ class Detections:
 
     def save(self, path: str | Path) -> None:
         """Write an npz file, atomically: a reader sees the old file or the whole new one."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(
-                    file,
-                    timestamps_ns=self.timestamps_ns,
-                    frame=self.frame,
-                    point=self.point,
-                    pixels=self.pixels,
-                    image_size=np.array(self.image_size),
-                )
-            os.replace(name, path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
+        content = io.BytesIO()
+        np.savez_compressed(
+            content,
+            timestamps_ns=self.timestamps_ns,
+            frame=self.frame,
+            point=self.point,
+            pixels=self.pixels,
+            image_size=np.array(self.image_size),
+        )
+        write_bytes(Path(path), content.getvalue())
 
     @classmethod
     def load(cls, path: str | Path) -> "Detections":

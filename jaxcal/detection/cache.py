@@ -1,10 +1,9 @@
 """Detections on disk: found again for the same images, target and detector; kept chunk by chunk while running."""
 
 import hashlib
+import io
 import json
-import os
 import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -12,6 +11,7 @@ from typing import Protocol, runtime_checkable
 import cv2
 import numpy as np
 
+from jaxcal.atomic import write_bytes
 from jaxcal.detection.corners import DETECTOR_VERSION
 from jaxcal.detection.worker import Corners
 from jaxcal.errors import CalibrationError
@@ -77,11 +77,9 @@ class DetectionCache:
 
     def save_part(self, frames: tuple[int, ...], corners: Corners) -> None:
         """Keep what was found in these frames until all are done."""
-        self._parts.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=self._parts, suffix=".tmp")
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, frame=corners.frame, point=corners.point, pixels=corners.pixels)
-        os.replace(name, self._part(frames))
+        content = io.BytesIO()
+        np.savez(content, frame=corners.frame, point=corners.point, pixels=corners.pixels)
+        write_bytes(self._part(frames), content.getvalue())
 
     def save(self, detections: Detections) -> None:
         """Keep the finished detections; the parts are no longer needed, nor are older ones of this camera."""

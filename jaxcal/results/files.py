@@ -25,10 +25,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcal.atomic import write_bytes, write_text
 from jaxcal.cameras import camera_model, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import Detections
-from jaxcal.results.atomic import write_bytes, write_text
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
 from jaxcal.results.kalibr import camchain, imu_entry, to_yaml
 from jaxcal.results.text import results_text

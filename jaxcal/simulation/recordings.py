@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import hashlib
+import io
 import json
 import os
 import shutil
@@ -15,6 +16,7 @@ import h5py
 import numpy as np
 import yaml
 
+from jaxcal.atomic import write_text
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import ImuRecording
@@ -103,7 +105,7 @@ def _claim(rig: SimulatedRig, folder: Path) -> None:
             f"{folder}: this folder is not empty and no simulation wrote it. Give an empty or a new folder."
         )
     folder.mkdir(parents=True, exist_ok=True)
-    _write_text(marker, json.dumps(mark, indent=1))
+    write_text(marker, json.dumps(mark, indent=1))
 
 
 def _remove(path: Path) -> None:
@@ -226,20 +228,12 @@ def _write_descriptions(rig: SimulatedRig, folder: Path) -> Path:
 
 
 def _write_yaml(path: Path, content: Any) -> None:
-    _write_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120))
+    write_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120))
 
 
 def _write_csv(path: Path, header: list[str], rows: list[tuple[Any, ...]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    with part.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows(rows)
-    os.replace(part, path)
-
-
-def _write_text(path: Path, text: str) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_text(text)
-    os.replace(part, path)
+    content = io.StringIO()
+    writer = csv.writer(content, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    write_text(path, content.getvalue())

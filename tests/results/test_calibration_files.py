@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from synthetic_calibration import APRIL_GRID, make_calibration
 
 import jaxcal
+from jaxcal.atomic import write_text
 from jaxcal.cameras import CameraModel, PinholeRadtan, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.results import Calibration, load_calibration, load_camchain, save_calibration
-from jaxcal.results.atomic import write_text
 from jaxcal.targets import Checkerboard
 
 

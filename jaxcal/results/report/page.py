@@ -9,9 +9,9 @@ import jinja2
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
+from jaxcal.atomic import write_text
 from jaxcal.observations import Frames
 from jaxcal.progress import Progress, no_progress
-from jaxcal.results.atomic import write_text
 from jaxcal.results.calibration import Calibration
 from jaxcal.results.report.camera_figures import camera_pictures
 from jaxcal.results.report.drawing import ACCENT, Picture, label, nothing_to_show, panel, to_svg
