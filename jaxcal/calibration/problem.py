@@ -16,8 +16,8 @@ from jaxcal.estimation import BlockArrow, band_from_windows, chain_from_windows
 class LensPrior(eqx.Module):
     """What is known of the lenses beforehand, per group: `mean` (C_g, n) and `information` (C_g, n, n)."""
 
-    mean: tuple[Float[Array, "C n"], ...]
-    information: tuple[Float[Array, "C n n"], ...]
+    mean: tuple[Float[Array, "_ _"], ...]
+    information: tuple[Float[Array, "_ _ _"], ...]
 
 
 class RigProblem(eqx.Module):
@@ -72,7 +72,7 @@ class RigProblem(eqx.Module):
             return vision.view_poses(state, data)
         return vision.spline_poses(state, data, self.imu.start, self.imu.dt, self.order)
 
-    def corner_errors(self, state: RigState) -> tuple[Float[Array, "F N 2"], ...]:
+    def corner_errors(self, state: RigState) -> tuple[Float[Array, "_ N 2"], ...]:
         """Projection minus measurement of every corner, px, per group."""
         return tuple(
             vision.frame_residuals(self.templates[g], state, data, self.poses(state, data), g)

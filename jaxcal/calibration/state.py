@@ -77,7 +77,7 @@ class RigState(eqx.Module):
     accel (K, 0 without IMU).
     """
 
-    lenses: tuple[Float[Array, "C n"], ...]
+    lenses: tuple[Float[Array, "_ _"], ...]
     R_cam_rig: Float[Array, "C 3 3"]
     t_cam_rig: Float[Array, "C 3"]
     shift: Float[Array, " C"]

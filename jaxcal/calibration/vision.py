@@ -40,13 +40,13 @@ class FramePoses(eqx.Module):
     (F, 3) derivatives by time (body frame; target frame).
     """
 
-    start: Int[Array, " F"]
-    rotation: Float[Array, "F 3 3"]
-    position: Float[Array, "F 3"]
-    by_rotation: Float[Array, "F 3 k 3"]
-    basis: Float[Array, "F k"]
-    omega: Float[Array, "F 3"]
-    velocity: Float[Array, "F 3"]
+    start: Int[Array, "*F"]
+    rotation: Float[Array, "*F 3 3"]
+    position: Float[Array, "*F 3"]
+    by_rotation: Float[Array, "*F 3 k 3"]
+    basis: Float[Array, "*F k"]
+    omega: Float[Array, "*F 3"]
+    velocity: Float[Array, "*F 3"]
 
 
 class PoseSource(Protocol):
