@@ -8,7 +8,7 @@ from jaxcal.errors import CalibrationError
 from jaxcal.targets import AprilGrid, Checkerboard, Target
 
 # Raised whenever the same image could give other corners than before: cached detections are then made anew.
-DETECTOR_VERSION = 1
+DETECTOR_VERSION = 2
 
 
 def find_corners(image: np.ndarray, target: Target) -> tuple[np.ndarray, np.ndarray]:
