@@ -24,7 +24,8 @@ def _strictly_increasing(name: str, timestamps_ns: np.ndarray) -> None:
         kind = "duplicate" if steps[place - 1] == 0 else "out of order"
         raise CalibrationError(
             f"{name}: timestamp {place} ({timestamps_ns[place]} ns) is {kind} (the one before "
-            f"is {timestamps_ns[place - 1]} ns). Timestamps must increase strictly: sort the recording and drop duplicates."
+            f"is {timestamps_ns[place - 1]} ns). Timestamps must increase strictly: sort the recording and drop "
+            "duplicates."
         )
 
 

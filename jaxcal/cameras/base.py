@@ -2,6 +2,8 @@
 
 import abc
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -20,8 +22,9 @@ class CameraModel(eqx.Module):
 
     A subclass is an `equinox.Module` whose array fields are its parameters, in the order in which they are estimated
     and printed. It writes `project` for ONE point of shape (3,), in JAX, returning pixels of shape (2,); `project` of
-    any subclass then also accepts arrays of points (..., 3). The first `num_intrinsics` scalars of the parameter
-    vector are reported as `intrinsics` (Kalibr: fx, fy, cx, cy for a pinhole), the others as `distortion`.
+    any subclass then also accepts arrays of points (..., 3), of jax, numpy or lists. The first `num_intrinsics` scalars
+    of the parameter vector are reported as `intrinsics` (Kalibr: fx, fy, cx, cy for a pinhole), the others as
+    `distortion`. A model with a closed form for `unproject` writes that for one pixel, likewise.
 
     Where a point cannot be projected (behind a pinhole, say) `project` may return anything, and `is_valid` says so.
     """
@@ -31,25 +34,16 @@ class CameraModel(eqx.Module):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        method = cls.__dict__.get("project")
-        if method is not None and not getattr(method, "__isabstractmethod__", False):
-            one_point = method if callable(method) else method.__get__  # equinox wraps methods in a descriptor
-            function = getattr(method, "method", one_point)
-
-            def project(self: "CameraModel", points: Float[Array, "*batch 3"]) -> Float[Array, "*batch 2"]:
-                points = jnp.asarray(points)
-                call = function
-                flat = points.reshape(-1, 3)
-                if points.ndim == 1:
-                    return call(self, points)
-                return jax.vmap(lambda point: call(self, point))(flat).reshape(*points.shape[:-1], 2)
-
-            project.__doc__ = getattr(function, "__doc__", None)
-            cls.project = project  # type: ignore[method-assign]
+        for name, size in (("project", 3), ("unproject", 2)):
+            if name in cls.__dict__:
+                setattr(cls, name, _batched(cls.__dict__[name], size))
 
     @abc.abstractmethod
-    def project(self, point: Float[Array, "*batch 3"]) -> Float[Array, "*batch 2"]:
-        """Pixels of points in the camera frame; written by subclasses for one point."""
+    def project(self, point: Any) -> Float[Array, "*batch 2"]:
+        """Pixels (..., 2) of points (..., 3) in the camera frame, metres; written by subclasses for one point.
+
+        Raises CalibrationError when the last axis is not 3.
+        """
 
     def is_valid(self, point: Float[Array, "3"]) -> Any:
         """Whether one point (3,) lies in the model's domain; by default, in front of the camera."""
@@ -60,10 +54,18 @@ class CameraModel(eqx.Module):
     @property
     def parameters(self) -> Float[Array, " n"]:
         """All parameters as one vector (n,), fields in order of their definition."""
-        return jnp.concatenate([jnp.ravel(jnp.asarray(getattr(self, f.name), dtype=jnp.float64)) for f in _fields(self)])
+        return jnp.concatenate(
+            [jnp.ravel(jnp.asarray(getattr(self, f.name), dtype=jnp.float64)) for f in _fields(self)]
+        )
 
-    def with_parameters(self, parameters: Float[Array, " n"]) -> "CameraModel":
-        """The same model with another parameter vector (n,)."""
+    def with_parameters(self, parameters: Any) -> "CameraModel":
+        """The same model with another parameter vector (n,). Raises CalibrationError when its length differs."""
+        parameters = jnp.asarray(parameters, dtype=float)
+        if parameters.shape != (self.num_parameters,):
+            raise CalibrationError(
+                f"camera model '{self.name or type(self).__name__}': parameters of shape {parameters.shape}; "
+                f"expected ({self.num_parameters},)."
+            )
         values, start = [], 0
         for field in _fields(self):
             old = jnp.asarray(getattr(self, field.name))
@@ -88,10 +90,13 @@ class CameraModel(eqx.Module):
 
     @classmethod
     def create(cls, intrinsics: Any, distortion: Any = ()) -> "CameraModel":
-        """Build the model from its intrinsics and distortion, as a Kalibr yaml gives them."""
+        """Build the model from its intrinsics and distortion, as a Kalibr yaml gives them.
+
+        Raises CalibrationError when there are too many or too few of either.
+        """
         vector = np.concatenate([np.ravel(intrinsics), np.ravel(distortion)]).astype(np.float64)
         template = cls.from_focal(1.0, (2, 2))
-        if len(vector) != template.num_parameters:
+        if np.size(intrinsics) != cls.num_intrinsics or len(vector) != template.num_parameters:
             raise CalibrationError(
                 f"camera model '{cls.name or cls.__name__}': {np.size(intrinsics)} intrinsics and "
                 f"{np.size(distortion)} distortion coefficients; expected {cls.num_intrinsics} and "
@@ -106,34 +111,55 @@ class CameraModel(eqx.Module):
 
     # --- what follows from `project` ---------------------------------------------------------------------------------
 
-    def unproject(self, pixels: Float[Array, "*batch 2"]) -> Float[Array, "*batch 3"]:
+    def unproject(self, pixel: Any) -> Float[Array, "*batch 3"]:
         """Rays (..., 3) of unit length through pixels (..., 2): Gauss-Newton on `project`, on the unit sphere.
 
-        Models with a closed form may override this.
+        Raises CalibrationError when the last axis is not 2.
         """
-        pixels = jnp.asarray(pixels)
-        rays = jax.vmap(self._unproject_one)(pixels.reshape(-1, 2))
-        return rays.reshape(*pixels.shape[:-1], 3)
+        return _batched(_unproject, 2)(self, pixel)
 
-    def _unproject_one(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
-        focal, centre = self.intrinsics[:2], self.intrinsics[2:4]
-        tangent = (pixel - centre) / focal
-        radius = jnp.sqrt(tangent @ tangent + 1e-30)
-        start = jnp.append(jnp.sin(radius) / radius * tangent, jnp.cos(radius))
-        # Points outside the forward half start on its rim: the equidistant guess is meant for fisheyes.
-        start = jnp.where(radius < 1.4, start, jnp.append(tangent / radius, 0.15))
 
-        def step(_: Any, ray: Array) -> Array:
-            error = self.project(ray) - pixel
-            jacobian = jax.jacfwd(self.project)(ray)
-            # Minimum-norm step; the radial direction is in the null space of the projection's Jacobian.
-            gram = jacobian @ jacobian.T
-            delta = -jacobian.T @ jnp.linalg.solve(gram + 1e-12 * jnp.trace(gram) * jnp.eye(2), error)
-            delta = delta * jnp.minimum(1.0, 0.3 / (jnp.linalg.norm(delta) + 1e-30))
-            moved = ray + delta
-            return moved / jnp.linalg.norm(moved)
+@eqx.filter_jit
+def _unproject(model: CameraModel, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
+    focal, centre = model.intrinsics[:2], model.intrinsics[2:4]
+    tangent = (pixel - centre) / focal
+    radius = jnp.sqrt(tangent @ tangent + 1e-30)
+    start = jnp.append(jnp.sin(radius) / radius * tangent, jnp.cos(radius))
+    # Points outside the forward half start on its rim: the equidistant guess is meant for fisheyes.
+    start = jnp.where(radius < 1.4, start, jnp.append(tangent / radius, 0.15))
 
-        return jax.lax.fori_loop(0, _UNPROJECT_STEPS, step, start / jnp.linalg.norm(start))
+    def step(_: Any, ray: Array) -> Array:
+        error = model.project(ray) - pixel
+        jacobian = jax.jacfwd(model.project)(ray)
+        # Minimum-norm step; the radial direction is in the null space of the projection's Jacobian.
+        gram = jacobian @ jacobian.T
+        delta = -jacobian.T @ jnp.linalg.solve(gram + 1e-12 * jnp.trace(gram) * jnp.eye(2), error)
+        # The constant keeps the gradient finite where the step is zero.
+        delta = delta * jnp.minimum(1.0, 0.3 / jnp.sqrt(delta @ delta + 1e-30))
+        moved = ray + delta
+        return moved / jnp.linalg.norm(moved)
+
+    return jax.lax.fori_loop(0, _UNPROJECT_STEPS, step, start / jnp.linalg.norm(start))
+
+
+def _batched(of_one: Callable[[Any, Array], Array], size: int) -> Callable[[Any, Any], Array]:
+    """A method of one vector (size,), as a method of an array-like (..., size)."""
+
+    @functools.wraps(of_one)
+    def of_many(self: CameraModel, vectors: Any) -> Array:
+        vectors = jnp.asarray(vectors, dtype=float)
+        if vectors.ndim == 0 or vectors.shape[-1] != size:
+            raise CalibrationError(
+                f"camera model '{self.name or type(self).__name__}': {of_one.__name__.lstrip('_')} got an array of "
+                f"shape {vectors.shape}; expected (..., {size})."
+            )
+        call = functools.partial(of_one, self)
+        if vectors.ndim == 1:
+            return call(vectors)
+        out = jax.vmap(call)(vectors.reshape(-1, size))
+        return out.reshape(*vectors.shape[:-1], out.shape[-1])
+
+    return of_many
 
 
 def _fields(model: CameraModel) -> list[dataclasses.Field[Any]]:

@@ -24,7 +24,7 @@ def radtan(plane: Float[Array, "2"], coefficients: Float[Array, "4"]) -> Float[A
 
 
 def equidistant(plane: Float[Array, "2"], coefficients: Float[Array, "4"]) -> Float[Array, "2"]:
-    """Equidistant fisheye k1..k4: theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8) (Kannala & Brandt 2006, eq. 6)."""
+    """Equidistant k1..k4: theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8) (Kannala & Brandt 2006, eq. 6)."""
     k1, k2, k3, k4 = coefficients
     r = jnp.sqrt(plane @ plane + 1e-24)  # the constant keeps the gradient at the centre finite
     theta = jnp.arctan(r)

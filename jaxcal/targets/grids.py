@@ -1,5 +1,6 @@
 """Checkerboard and AprilGrid."""
 
+import numbers
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +11,10 @@ from jaxcal.targets.base import Target
 
 def _check(name: str, counts: dict[str, int], lengths: dict[str, float]) -> None:
     for key, count in counts.items():
-        if count < 1 or count != int(count):
+        if not isinstance(count, numbers.Integral) or count < 1:
             raise CalibrationError(f"{name}: {key} is {count}; expected a whole number, at least 1.")
     for key, length in lengths.items():
-        if not np.isfinite(length) or length <= 0:
+        if not isinstance(length, numbers.Real) or not np.isfinite(length) or length <= 0:
             raise CalibrationError(f"{name}: {key} is {length}; expected a positive length.")
 
 
@@ -104,7 +105,12 @@ class AprilGrid(Target):
         return np.stack([xx, yy, np.zeros_like(xx)], axis=-1).reshape(-1, 3)
 
     def tag_points(self, tag_id: int) -> np.ndarray:
-        """Point indices (4,) of one tag's corners, anticlockwise from the lower left as Kalibr orders them."""
+        """Point indices (4,) of one tag's corners, anticlockwise from the lower left as Kalibr orders them.
+
+        Raises CalibrationError when the board has no such tag.
+        """
+        if not 0 <= tag_id < self.rows * self.cols:
+            raise CalibrationError(f"AprilGrid: tag {tag_id} is not among its {self.rows * self.cols} tags, 0 onwards.")
         row, col = divmod(tag_id, self.cols)
         width = 2 * self.cols
         low = 2 * row * width + 2 * col

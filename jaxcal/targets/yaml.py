@@ -49,10 +49,25 @@ def target_from_yaml(content: Any, where: str) -> Target:
     missing = [key for key in keys if key not in content]
     if missing:
         raise CalibrationError(f"{where}: '{missing[0]}' is missing. A {kind} has {', '.join(keys)}.")
+    rows, cols = (_whole(f"{where}: '{key}'", content[key]) for key in keys[:2])
+    first, second = (_number(f"{where}: '{key}'", content[key]) for key in keys[2:])
     try:
-        rows, cols, first, second = int(content[keys[0]]), int(content[keys[1]]), *map(float, (content[keys[2]], content[keys[3]]))
+        if kind == "aprilgrid":
+            return AprilGrid(rows=rows, cols=cols, tag_size=first, tag_spacing=second)
+        return Checkerboard(rows=rows, cols=cols, spacing=first, col_spacing=second)
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from error
+
+
+def _number(place: str, value: Any) -> float:
+    try:
+        return float(value)  # of text too: to yaml 1.1, '1e-2' is text
     except (TypeError, ValueError) as error:
-        raise CalibrationError(f"{where}: a value is not a number: {error}.") from error
-    if kind == "aprilgrid":
-        return AprilGrid(rows=rows, cols=cols, tag_size=first, tag_spacing=second)
-    return Checkerboard(rows=rows, cols=cols, spacing=first, col_spacing=second)
+        raise CalibrationError(f"{place} is {value!r}; expected a number.") from error
+
+
+def _whole(place: str, value: Any) -> int:
+    number = _number(place, value)
+    if not number.is_integer():
+        raise CalibrationError(f"{place} is {value!r}; expected a whole number.")
+    return int(number)
