@@ -30,6 +30,8 @@ from jaxcal.targets import Target
 _MARGIN_S = 0.1
 # Frames nearer than this to the spline's ends are left out (s).
 _EDGE_S = 0.01
+# Autocorrelations of IMU residuals below this are taken for noise.
+_CLEARLY_CORRELATED = 0.05
 # Tracks thin frames out to this spacing (s) when those of several cameras are merged.
 _TRACK_STEP_S = 0.004
 
@@ -79,9 +81,7 @@ def calibrate_camera_imu(
     for name, ok in zip(names, usable, strict=True):
         if ok.sum() < 3:
             raise CalibrationError(f"{name}: {ok.sum()} frames lie within the IMU recording; at least 3 are needed.")
-    data, slots, samples = spline_setup.bin_imu(
-        grid, imu_time, imu.gyro_rad_s, imu.accel_m_s2, imu.noise, imu.rate_hz
-    )
+    data, slots, samples = spline_setup.bin_imu(grid, imu_time, imu.gyro_rad_s, imu.accel_m_s2, imu.noise, imu.rate_hz)
     problem = _problem(lenses, frames, target, start, data, grid, cameras, names, intrinsics)
     state = _first_state(lenses, problem.layout, start, grid, imu, imu_time)
 
@@ -180,9 +180,7 @@ def _align_all(
     return _Start(times, tracks, alignments, arms, sigmas, reference)
 
 
-def _grid(
-    start: _Start, imu_time: np.ndarray, imu: ImuRecording, order: int, knot_rate_hz: float | None
-) -> SplineGrid:
+def _grid(start: _Start, imu_time: np.ndarray, imu: ImuRecording, order: int, knot_rate_hz: float | None) -> SplineGrid:
     first = min(t.time_s[0] + a.shift_s for t, a in zip(start.tracks, start.alignments, strict=True)) - _MARGIN_S
     last = max(t.time_s[-1] + a.shift_s for t, a in zip(start.tracks, start.alignments, strict=True)) + _MARGIN_S
     first, last = max(first, imu_time[0]), min(last, imu_time[-1])
@@ -215,9 +213,7 @@ def _problem(
         prior = _lens_prior(cameras, layout)
     return RigProblem(
         templates=solving.templates_of(lenses, layout),
-        corners=vision_data(
-            layout, frames, target, weights=[np.ones(f.seen.shape) for f in frames], times=start.times
-        ),
+        corners=vision_data(layout, frames, target, weights=[np.ones(f.seen.shape) for f in frames], times=start.times),
         imu=data,
         prior=prior,
         free_chain=jnp.ones((grid.intervals + grid.order - 1, 12), dtype=bool),
@@ -293,14 +289,29 @@ def _whitened_imu(problem: RigProblem, state: RigState) -> jnp.ndarray:
 
 
 def _noise_ratio(problem: RigProblem, state: RigState, data: InertialData, grid: SplineGrid) -> np.ndarray:
-    """How much larger than `data` says the noise of gyro and accel is (2,), degrees of freedom of the spline accounted."""
+    """How much larger than `data` says the noise of gyro and accel is (2,), degrees of freedom of the spline accounted.
+
+    Residuals that hang together over time (a scale error, vibration, jitter of the clock) are worth fewer samples than
+    they number: their noise is raised by the root of the autocorrelation time as well, or they would bend the lenses.
+    """
     assert problem.imu is not None
     scale = np.asarray(data.inverse_sigma / problem.imu.inverse_sigma)
-    residuals = np.asarray(_whitened_imu(problem, state)) * scale
-    count = float(np.sum(data.present))
-    freedom = max(1.0 - (grid.used + grid.order - 1) / count, 0.1)
-    mean_square = np.sum(residuals**2, axis=(0, 1)) / (count * freedom)
-    return np.sqrt(mean_square.reshape(2, 3).mean(axis=1))
+    residuals = (np.asarray(_whitened_imu(problem, state)) * scale)[np.asarray(data.present) > 0]
+    freedom = max(1.0 - (grid.used + grid.order - 1) / len(residuals), 0.1)
+    power = np.mean(residuals**2, axis=0) / freedom
+    inflated = power * np.array([autocorrelation_time(axis) for axis in residuals.T])
+    return np.sqrt(inflated.reshape(2, 3).mean(axis=1))
+
+
+def autocorrelation_time(series: np.ndarray) -> float:
+    """Integrated autocorrelation time, in samples: 1 for white noise (Sokal 1997, eq. 3.16, summed while it is
+    clearly positive)."""
+    series = series - series.mean()
+    spectrum = np.abs(np.fft.rfft(series, 2 * len(series))) ** 2
+    covariance = np.fft.irfft(spectrum)[: len(series) // 2]
+    correlation = covariance[1:] / max(covariance[0], 1e-300)
+    ends = np.flatnonzero(correlation < _CLEARLY_CORRELATED)
+    return float(1.0 + 2.0 * np.sum(correlation[: ends[0] if len(ends) else len(correlation)]))
 
 
 def _reweigh_imu(data: InertialData, grid: SplineGrid):
@@ -318,8 +329,9 @@ def _imu_warnings(fit: RobustFit, data: InertialData) -> list[str]:
     assert fit.problem.imu is not None
     ratio = np.asarray(data.inverse_sigma / fit.problem.imu.inverse_sigma)[[0, 3]]
     return [
-        f"The {sensor}'s readings scatter {factor:.1f} times more about the trajectory than imu.yaml's "
-        f"{sensor}_noise_density says; the larger noise was used. Vibration, a loose mount or a datasheet value do this."
+        f"The {sensor}'s readings scatter {factor:.1f} times more about the trajectory, or hang together over longer, "
+        f"than imu.yaml's {sensor}_noise_density allows; the larger noise was used. Vibration, a loose mount, a scale "
+        "error of the sensor or a datasheet value do this."
         for sensor, factor in zip(("gyroscope", "accelerometer"), ratio, strict=True)
         if factor > 2.0
     ]

@@ -59,7 +59,12 @@ def chain_cameras(
     with the others.
     """
     count = len(names)
-    shared = {(a, b): np.intersect1d(views[a], views[b], return_indices=True)[1:] for a in range(count) for b in range(count) if a != b}
+    shared = {
+        (a, b): np.intersect1d(views[a], views[b], return_indices=True)[1:]
+        for a in range(count)
+        for b in range(count)
+        if a != b
+    }
     rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     joined = [0]
     while len(joined) < count:

@@ -51,7 +51,9 @@ class TurnIntegral:
 
     def mean_rate(self, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
         """Mean angular velocity (n, 3) over spans; NaN where a span leaves the recording."""
-        ends = [np.stack([np.interp(t, self._time, self._integral[:, a]) for a in range(3)], axis=1) for t in (start, stop)]
+        ends = [
+            np.stack([np.interp(t, self._time, self._integral[:, a]) for a in range(3)], axis=1) for t in (start, stop)
+        ]
         rate = (ends[1] - ends[0]) / (stop - start)[:, None]
         outside = (start < self._time[0]) | (stop > self._time[-1])
         rate[outside] = np.nan
@@ -104,9 +106,7 @@ def _camera_rates(track: CameraTrack, name: str) -> tuple[np.ndarray, np.ndarray
     return track.time_s[:-1][near], track.time_s[1:][near], rate
 
 
-def _coarse_shift(
-    start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral
-) -> tuple[float, float]:
+def _coarse_shift(start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral) -> tuple[float, float]:
     """Offset with the largest correlation of rate magnitudes over at least half of the spans."""
     magnitude = np.linalg.norm(rate, axis=1)
     best = (0.0, -1.0)
@@ -146,9 +146,7 @@ def _rotation(
     return R, bias, float(np.mean(error[kept])), np.sqrt(values / max(kept.sum(), 1))
 
 
-def orientation_track(
-    time_s: np.ndarray, rotation: np.ndarray, imu_time_s: np.ndarray, gyro: np.ndarray
-) -> np.ndarray:
+def orientation_track(time_s: np.ndarray, rotation: np.ndarray, imu_time_s: np.ndarray, gyro: np.ndarray) -> np.ndarray:
     """R_target_imu (N, 3, 3) at every IMU sample: the gyroscope's integral, bent to pass through the frames' orientations.
 
     `time_s` (F,) frames on the IMU's clock, increasing; `rotation` (F, 3, 3) R_target_imu there. Gaps between frames
@@ -202,7 +200,9 @@ def lever_arms(
     return arms
 
 
-def check_coverage(tracks: Sequence[CameraTrack], shifts: Sequence[float], imu: ImuRecording, imu_time_s: np.ndarray) -> None:
+def check_coverage(
+    tracks: Sequence[CameraTrack], shifts: Sequence[float], imu: ImuRecording, imu_time_s: np.ndarray
+) -> None:
     """Raise CalibrationError when frames and IMU hardly overlap in time."""
     spans = [(t.time_s[0] + s, t.time_s[-1] + s) for t, s in zip(tracks, shifts, strict=True)]
     first, last = max(min(a for a, _ in spans), imu_time_s[0]), min(max(b for _, b in spans), imu_time_s[-1])

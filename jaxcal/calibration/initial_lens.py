@@ -80,7 +80,9 @@ def board_poses(model: CameraModel, frames: CameraFrames, target: Target) -> tup
     errors = np.full((2, len(frames.frames)), np.inf)
     for s in range(2):
         projected = np.asarray(
-            _project(model, jnp.asarray(candidates[s, :, :, :3]), jnp.asarray(candidates[s, :, :, 3]), jnp.asarray(points))
+            _project(
+                model, jnp.asarray(candidates[s, :, :, :3]), jnp.asarray(candidates[s, :, :, 3]), jnp.asarray(points)
+            )
         )[: len(frames.frames)]
         squared = np.sum((projected - frames.pixels) ** 2, axis=-1)
         squared = np.where(np.isfinite(squared), np.minimum(squared, 1e12), 1e12)

@@ -129,9 +129,7 @@ class RigProblem(eqx.Module):
                 rows = self.layout.lens(camera)
                 corner = corner.at[rows, rows].add(self.prior.information[group][place])
                 gradient = gradient.at[rows].add(force[place])
-        return eqx.tree_at(
-            lambda e: (e.corner, e.gradient_shared, e.cost), equations, (corner, gradient, cost)
-        )
+        return eqx.tree_at(lambda e: (e.corner, e.gradient_shared, e.cost), equations, (corner, gradient, cost))
 
 
 def _sum_by_camera(

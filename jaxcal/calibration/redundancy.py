@@ -19,13 +19,15 @@ _PAIRS = 4000
 _MOST_VIEWS = 3000
 # Correlations below this are taken for noise: independent corners in some thousand pairs stay well under it.
 _NEGLIGIBLE = 0.08
-# The share of views, the least repeated ones, that get full weight.
+# The share of views, the least repeated ones, that get weight one.
 _FULL_WEIGHT_QUANTILE = 0.98
+# Weights above that are let through up to here: the few views at the rim are all there is to tell of it.
+_LARGEST_WEIGHT = 4.0
 
 
 @dataclass(frozen=True)
 class Redundancy:
-    """`weights` (F,) in (0, 1], relative; `inflation` by which a covariance from these weights is too small;
+    """`weights` (F,) of the views, relative, about 1 for those that stand for themselves; `inflation` by which a covariance from these weights is too small;
     `correlation` of residuals in views that look alike."""
 
     weights: np.ndarray
@@ -63,7 +65,7 @@ def measure_redundancy(frames: CameraFrames, errors: np.ndarray, usable: np.ndar
         return even
     weights = 1.0 / _stands_for(features)
     full = float(np.quantile(weights, _FULL_WEIGHT_QUANTILE))
-    return Redundancy(np.minimum(weights / full, 1.0), 1.0 / full, correlation)
+    return Redundancy(np.minimum(weights / full, _LARGEST_WEIGHT), 1.0 / full, correlation)
 
 
 def _correlation_of_look_alikes(features: np.ndarray, errors: np.ndarray, usable: np.ndarray) -> float:

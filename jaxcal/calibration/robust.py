@@ -90,9 +90,7 @@ def robust_fit(
         if stage < 3:
             sigmas = [outliers.robust_sigma(e, s) for e, s in zip(errors, kept, strict=True)]
         if stage == 1:
-            redundancy = [
-                measure_redundancy(*parts) for parts in zip(cameras, errors, seen, sigmas, strict=True)
-            ]
+            redundancy = [measure_redundancy(*parts) for parts in zip(cameras, errors, seen, sigmas, strict=True)]
         if stage == 2:
             kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(errors, seen, sigmas, strict=True)]
         if stage >= 3:

@@ -128,7 +128,9 @@ def transform(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     return out
 
 
-def camera_model_of(state: RigState, layout: SharedLayout, templates: tuple[CameraModel, ...], camera: int) -> CameraModel:
+def camera_model_of(
+    state: RigState, layout: SharedLayout, templates: tuple[CameraModel, ...], camera: int
+) -> CameraModel:
     """The camera model of one camera at this state."""
     group, place = layout.place(camera)
     return templates[group].with_parameters(state.lenses[group][place])

@@ -140,7 +140,9 @@ class BlockArrowFactor(eqx.Module):
         eye = jnp.eye(n)
         shared = self.shared_covariance()
 
-        def backward(carry: tuple[Array, Array], factor: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], Array]:
+        def backward(
+            carry: tuple[Array, Array], factor: tuple[Array, Array, Array]
+        ) -> tuple[tuple[Array, Array], Array]:
             # With L the full factor and Z its inverse product, rows of superblock j:
             # Z[j, later] = -L_jj^-T (L_later,j)' Z[later, later]
             later_cov, later_cross = carry  # Z[j+1, j+1] (n, n), Z[j+1, shared] (n, P)

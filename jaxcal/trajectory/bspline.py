@@ -22,9 +22,7 @@ def basis_matrix(order: int) -> np.ndarray:
     matrix = np.zeros((k, k))
     for s in range(k):  # basis function of control point s
         for n in range(k):  # power of u
-            total = sum(
-                (-1) ** (l - s) * math.comb(k, l - s) * float(k - 1 - l) ** (k - 1 - n) for l in range(s, k)
-            )
+            total = sum((-1) ** (l - s) * math.comb(k, l - s) * float(k - 1 - l) ** (k - 1 - n) for l in range(s, k))
             matrix[s, n] = math.comb(k - 1, n) * total / math.factorial(k - 1)
     return matrix
 
@@ -35,7 +33,9 @@ def cumulative_basis_matrix(order: int) -> np.ndarray:
     return np.cumsum(basis_matrix(order)[::-1], axis=0)[::-1].copy()
 
 
-def weights(matrix: np.ndarray, u: Float[Array, ""], dt: float | Float[Array, ""], derivative: int) -> Float[Array, " k"]:
+def weights(
+    matrix: np.ndarray, u: Float[Array, ""], dt: float | Float[Array, ""], derivative: int
+) -> Float[Array, " k"]:
     """Derivative in time of the (cumulative) basis functions at `u` in an interval of `dt` seconds."""
     k = matrix.shape[0]
     factors = [float(math.perm(n, derivative)) for n in range(k)]
