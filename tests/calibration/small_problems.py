@@ -1,0 +1,128 @@
+"""Small calibration problems in random states near consistency, for comparison with dense linear algebra."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxcal import Checkerboard, Detections, ImuNoise
+from jaxcal.calibration import solving
+from jaxcal.calibration.assemble import CameraFrames, camera_frames, vision_data
+from jaxcal.calibration.problem import LensPrior, RigProblem
+from jaxcal.calibration.spline_setup import bin_imu, make_grid
+from jaxcal.calibration.state import RigState, layout_of
+from jaxcal.cameras import CameraModel, PinholeEquidistant, PinholeRadtan
+
+BOARD = Checkerboard(rows=3, cols=4, spacing=0.1)
+SIZE = (640, 480)
+# The equal models are not neighbours, so that the order of groups differs from that of cameras.
+LENSES: tuple[CameraModel, ...] = (
+    PinholeRadtan.create([430.0, 433.0, 321.0, 238.0], [-0.30, 0.10, 0.0007, -0.0005]),
+    PinholeEquidistant.create([380.0, 378.0, 316.0, 243.0], [0.02, -0.01, 0.004, -0.001]),
+    PinholeRadtan.create([445.0, 441.0, 325.0, 235.0], [-0.28, 0.08, -0.0004, 0.0003]),
+)
+CAMERAS = len(LENSES)
+
+
+def near(rng: np.random.Generator, rotation: np.ndarray, angle: float) -> np.ndarray:
+    """A rotation (3, 3) some `angle` (rad) away."""
+    return Rotation.from_rotvec(angle * rng.standard_normal(3)).as_matrix() @ rotation
+
+
+def random_frames(rng: np.random.Generator, count: int, missing: float) -> list[CameraFrames]:
+    """`count` frames per camera with corners anywhere in the image; the residuals need not be small."""
+    cameras = []
+    for c in range(CAMERAS):
+        frame, point = np.nonzero(rng.random((count, len(BOARD.points))) >= missing)
+        pixels = rng.uniform(100.0, 380.0, (len(frame), 2))
+        detections = Detections(1000 * np.arange(count), frame, point, pixels, SIZE)
+        cameras.append(camera_frames(detections, BOARD, f"cam{c}", min_corners=4))
+    return cameras
+
+
+def random_weights(rng: np.random.Generator, cameras: Sequence[CameraFrames]) -> list[np.ndarray]:
+    return [rng.uniform(0.5, 4.0, frames.seen.shape) for frames in cameras]
+
+
+def random_prior(rng: np.random.Generator, problem: RigProblem, state: RigState) -> RigProblem:
+    """The problem with a lens prior of full information matrices, whose means differ from the state's lenses."""
+    means, informations = [], []
+    for lenses in state.lenses:
+        root = rng.standard_normal((*lenses.shape, lenses.shape[1]))
+        informations.append(jnp.asarray(root @ root.swapaxes(-1, -2)))
+        means.append(lenses + jnp.asarray(0.1 * rng.standard_normal(lenses.shape)))
+    return eqx.tree_at(lambda p: p.prior, problem, LensPrior(tuple(means), tuple(informations)))
+
+
+def facing_board(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """T_target_rig of `count` poses about a metre before the board."""
+    rotations = np.stack([near(rng, np.diag([1.0, -1.0, -1.0]), 0.2) for _ in range(count)])
+    positions = np.array([0.15, 0.1, 1.0]) + 0.1 * rng.standard_normal((count, 3))
+    return rotations, positions
+
+
+def extrinsics(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    rotations = np.stack([near(rng, np.eye(3), 0.1) for _ in range(CAMERAS)])
+    return rotations, 0.1 * rng.standard_normal((CAMERAS, 3))
+
+
+def camera_only(seed: int) -> tuple[RigProblem, RigState]:
+    """Five views, not every one seen by every camera; cam0's pose, time shifts and gravity are held."""
+    rng = np.random.default_rng(seed)
+    cameras = random_frames(rng, 4, missing=0.2)
+    problem, state = solving.camera_problem(
+        LENSES,
+        cameras,
+        BOARD,
+        views=[np.array([0, 1, 2, 3]), np.array([1, 2, 3, 4]), np.array([0, 2, 3, 4])],
+        weights=random_weights(rng, cameras),
+        T_cam_rig=extrinsics(rng),
+        T_target_rig=facing_board(rng, 5),
+        huber_width=np.inf,
+    )
+    return random_prior(rng, problem, state), state
+
+
+def with_imu(seed: int, order: int) -> tuple[RigProblem, RigState]:
+    """A spline of one second (20 knots) with IMU samples and unsynchronised frames; everything is free."""
+    rng = np.random.default_rng(seed)
+    grid = make_grid(0.0, 1.0, order, 20.0)
+    cameras = random_frames(rng, 4, missing=0.2)
+    time = np.sort(rng.uniform(0.0, 1.0, 60))
+    gyro = rng.standard_normal((60, 3))
+    accel = np.array([0.0, -9.8, 0.0]) + rng.standard_normal((60, 3))
+    data, _, _ = bin_imu(grid, time, gyro, accel, ImuNoise(0.01, 0.02, 0.05, 0.1, update_rate=60.0), 60.0)
+    layout = layout_of(list(LENSES))
+    count = grid.intervals + order - 1
+    problem = RigProblem(
+        templates=solving.templates_of(LENSES, layout),
+        corners=vision_data(
+            layout,
+            cameras,
+            BOARD,
+            weights=random_weights(rng, cameras),
+            times=[np.sort(rng.uniform(0.05, 0.95, len(frames.frames))) for frames in cameras],
+        ),
+        imu=data,
+        prior=solving.no_prior(layout),
+        free_chain=jnp.ones((count, 12), dtype=bool),
+        free=jnp.ones(layout.size, dtype=bool),
+        huber_width=jnp.asarray(jnp.inf),
+        layout=layout,
+        order=order,
+    )
+    turns = Rotation.from_rotvec(np.cumsum(0.1 * rng.standard_normal((count, 3)), axis=0)).as_matrix()
+    R_cam_rig, t_cam_rig = extrinsics(rng)
+    state = RigState(
+        lenses=solving.stack_lenses(LENSES, layout),
+        R_cam_rig=jnp.asarray(R_cam_rig),
+        t_cam_rig=jnp.asarray(t_cam_rig),
+        shift=jnp.asarray(rng.uniform(-0.02, 0.02, CAMERAS)),
+        gravity=jnp.asarray([0.3, -9.7, 1.1]),
+        rotations=jnp.asarray(np.diag([1.0, -1.0, -1.0]) @ turns),
+        positions=jnp.asarray(np.array([0.15, 0.1, 1.0]) + 0.05 * rng.standard_normal((count, 3))),
+        biases=jnp.asarray(0.1 * rng.standard_normal((count, 6))),
+    )
+    return random_prior(rng, problem, state), state
