@@ -1,5 +1,6 @@
 """The corridor: from files to a calibration, with everything cached that took long."""
 
+import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -253,3 +254,9 @@ def test_the_cache_moves_where_it_can_be_written(
     (event_rig.parent / ".jaxcal").write_text("not a folder")
     walk(event_rig)
     assert (event_rig.parent / "out" / "cache" / "frames").is_dir()
+
+
+def test_torch_is_imported_only_where_there_are_events() -> None:
+    code = "import sys, jaxcal, jaxcal.pipeline, jaxcal.recording, jaxcal.detection; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.strip() == "False"
