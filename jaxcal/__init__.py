@@ -10,7 +10,7 @@ import platformdirs
 # Estimation is in double precision; this is the one place that says so.
 jax.config.update("jax_enable_x64", True)
 # Compiled programs are kept between runs, unless the user has chosen a place or switched it off.
-if jax.config.jax_compilation_cache_dir is None:
+if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
     jax.config.update("jax_compilation_cache_dir", platformdirs.user_cache_dir("jaxcal") + "/xla")
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 

@@ -1,5 +1,6 @@
 """Poses between cameras from the views they share: a graph, its spanning tree, and robust averages along it."""
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -34,7 +35,7 @@ def associate(cameras: Sequence[CameraFrames], tolerance_ns: int) -> tuple[list[
 def relative_pose(
     first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """T_b_a from poses T_a_target and T_b_target in shared views: the view that agrees best with all others (medoid)."""
+    """T_b_a from poses T_a_target and T_b_target in shared views: the view that agrees best with all others."""
     step = max(1, len(first[0]) // _MEDOID_VIEWS)
     (Ra, ta), (Rb, tb) = ((R[::step], t[::step]) for R, t in (first, second))
     rotation = Rb @ Ra.swapaxes(-1, -2)
@@ -59,12 +60,8 @@ def chain_cameras(
     with the others.
     """
     count = len(names)
-    shared = {
-        (a, b): np.intersect1d(views[a], views[b], return_indices=True)[1:]
-        for a in range(count)
-        for b in range(count)
-        if a != b
-    }
+    pairs = itertools.permutations(range(count), 2)
+    shared = {(a, b): np.intersect1d(views[a], views[b], return_indices=True)[1:] for a, b in pairs}
     rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     joined = [0]
     while len(joined) < count:

@@ -21,8 +21,9 @@ _BIAS_SIGMA = (0.3, 2.0)
 class InertialData(eqx.Module):
     """IMU samples binned by knot interval, padded to S per interval.
 
-    `fraction` (I, S) place in the interval; `readings` (I, S, 6) gyro then accel; `present` (I, S) 1 or 0; `inverse_sigma`
-    (6,) of one sample; `walk_sigma` (6,) of the biases over one knot interval; `start`, `dt` of the spline, s.
+    `fraction` (I, S) place in the interval; `readings` (I, S, 6) gyro then accel; `present` (I, S) 1 or 0;
+    `inverse_sigma` (6,) of one sample; `walk_sigma` (6,) of the biases over one knot interval; `start`, `dt` of the
+    spline, s.
     """
 
     fraction: Float[Array, "I S"]

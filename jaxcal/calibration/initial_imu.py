@@ -1,4 +1,4 @@
-"""Time offset, rotation to the IMU and gyro bias from turning alone; gravity and first spline from the board's poses."""
+"""Time offset, rotation to the IMU and gyro bias from turning alone; gravity and a first trajectory."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class CameraTrack:
 @dataclass(frozen=True)
 class Alignment:
     """Camera against IMU: `shift_s` (t_imu = t_cam + shift), `R_cam_imu` (3, 3), `gyro_bias` (3,) rad/s, `correlation`
-    of the rates of turn, and how strongly the turning spans three dimensions (`excitation`, rad/s, smallest of three)."""
+    of the rates of turn, and how strongly the turning spans three dimensions (`excitation` (3,), rad/s)."""
 
     shift_s: float
     R_cam_imu: np.ndarray
@@ -49,12 +49,12 @@ class TurnIntegral:
         self._time = time_s
         self._integral = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * step * (gyro[1:] + gyro[:-1]), axis=0)])
 
+    def _at(self, time_s: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(time_s, self._time, self._integral[:, a]) for a in range(3)], axis=1)
+
     def mean_rate(self, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
         """Mean angular velocity (n, 3) over spans; NaN where a span leaves the recording."""
-        ends = [
-            np.stack([np.interp(t, self._time, self._integral[:, a]) for a in range(3)], axis=1) for t in (start, stop)
-        ]
-        rate = (ends[1] - ends[0]) / (stop - start)[:, None]
+        rate = (self._at(stop) - self._at(start)) / (stop - start)[:, None]
         outside = (start < self._time[0]) | (stop > self._time[-1])
         rate[outside] = np.nan
         return rate
@@ -147,7 +147,7 @@ def _rotation(
 
 
 def orientation_track(time_s: np.ndarray, rotation: np.ndarray, imu_time_s: np.ndarray, gyro: np.ndarray) -> np.ndarray:
-    """R_target_imu (N, 3, 3) at every IMU sample: the gyroscope's integral, bent to pass through the frames' orientations.
+    """R_target_imu (N, 3, 3) at every IMU sample: the gyroscope's integral, bent to pass through the frames.
 
     `time_s` (F,) frames on the IMU's clock, increasing; `rotation` (F, 3, 3) R_target_imu there. Gaps between frames
     are carried by the gyroscope alone.

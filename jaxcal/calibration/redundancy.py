@@ -27,8 +27,11 @@ _LARGEST_WEIGHT = 4.0
 
 @dataclass(frozen=True)
 class Redundancy:
-    """`weights` (F,) of the views, relative, about 1 for those that stand for themselves; `inflation` by which a covariance from these weights is too small;
-    `correlation` of residuals in views that look alike."""
+    """What the views of one camera are worth.
+
+    `weights` (F,) of the views, relative, about 1 for those that stand for themselves; `inflation` by which a
+    covariance from these weights is too small; `correlation` of residuals in views that look alike.
+    """
 
     weights: np.ndarray
     inflation: float

@@ -64,8 +64,8 @@ def robust_fit(
 
     Rounds: Huber's loss with `first_sigmas`; Huber's loss with the noise found (median); the same with each view
     weighted by what it adds (`redundancy`); plain least squares on the inliers; the same with the noise of the inliers
-    (root mean square). `usable[c]` (F,) are the frames that may take part; `pose_parameters[c]` how many parameters of the trajectory a camera's corners pay for, for the degrees of
-    freedom.
+    (root mean square). `usable[c]` (F,) are the frames that may take part; `pose_parameters[c]` how many parameters of
+    the trajectory a camera's corners pay for, for the degrees of freedom.
     """
     layout = problem.layout
     seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]

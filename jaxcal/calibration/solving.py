@@ -93,7 +93,7 @@ def refine_single(
     max_steps: int,
     huber_width: float = 3.0,
 ) -> tuple[CameraModel, float]:
-    """Optimise one camera and its board poses; the refined model and the cost (half the robust sum of squares, px^2)."""
+    """Optimise one camera and its board poses; the refined model and the cost (half the robust squares, px^2)."""
     R_target_cam = R_cam_target.swapaxes(-1, -2)
     problem, state = camera_problem(
         [model],

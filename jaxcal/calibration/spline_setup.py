@@ -92,7 +92,7 @@ def first_chain(
     position: np.ndarray,
     gyro_bias: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First control rotations (K, 3, 3), positions (K, 3) and biases (K, 6): the curves' values at the control times."""
+    """First control rotations (K, 3, 3), positions (K, 3), biases (K, 6): the curves' values at the control times."""
     times = grid.control_times
     clipped = np.clip(times, orientation_time_s[0], orientation_time_s[-1])
     rotations = Slerp(orientation_time_s, Rotation.from_matrix(orientation))(clipped).as_matrix()

@@ -41,7 +41,7 @@ def shared_covariance(
 
 def _unobserved_sentence(direction: np.ndarray, labels: np.ndarray) -> str:
     strongest = np.argsort(-np.abs(direction))[:4]
-    named = ", ".join(labels[k] for k in strongest if abs(direction[k]) > 0.2)
+    named = ", ".join(str(labels[k]) for k in strongest if abs(direction[k]) > 0.2)
     return (
         f"The recording does not determine a combination of: {named}. Do not use these values; record with more varied "
         "tilt, distance and place in the image (with an IMU: rotate about two axes at least)."

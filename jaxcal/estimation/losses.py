@@ -5,9 +5,10 @@ from jaxtyping import Array, Float
 
 
 def huber(squared: Float[Array, "*shape"], width: Float[Array, ""] | float) -> tuple[Array, Array]:
-    """Huber's loss (Huber 1964) of s = r'r: (rho, weight) with rho = s inside `width`, 2 width sqrt(s) - width^2 outside.
+    """Huber's loss (Huber 1964) of s = r'r: (rho, weight), rho = s inside `width` and 2 width sqrt(s) - width^2 outside.
 
-    `weight` is drho/ds, the factor of iteratively re-weighted least squares. An infinite `width` is plain least squares.
+    `weight` is drho/ds, the factor of iteratively re-weighted least squares; an infinite `width` is plain least
+    squares.
     """
     root = jnp.sqrt(jnp.maximum(squared, 1e-24))
     inside = root <= width

@@ -10,7 +10,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.estimation.block_arrow import BlockArrow
-from jaxcal.estimation.descent import BlockArrowDescent, BlockStep
+from jaxcal.estimation.descent import BlockArrowDescent
 from jaxcal.estimation.problem import BlockArrowProblem, State
 from jaxcal.estimation.threads import single_threaded_blas
 

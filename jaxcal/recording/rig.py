@@ -1,5 +1,6 @@
 """rig.yaml: which cameras and IMU were recorded, where their files are, and what stood in front of them."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -177,7 +178,7 @@ def _reconstruction(content: Any, folder: Path, where: str) -> RigReconstruction
 
 
 def _existing(content: Any, folder: Path, where: str) -> Path:
-    path = folder / Path(as_text(content, where)).expanduser()
+    path = folder / Path(os.path.expandvars(as_text(content, where))).expanduser()
     if not path.exists():
         raise CalibrationError(f"{where}: {path} does not exist. Paths are relative to the rig file's folder.")
     return path

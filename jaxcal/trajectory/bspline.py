@@ -57,7 +57,7 @@ class RotationPoint(eqx.Module):
 
 
 class Increments(eqx.Module):
-    """What neighbouring control rotations share: d_j = Log(R_j^T R_j+1), and its Jacobians by their right perturbations."""
+    """d_j = Log(R_j^T R_j+1) of neighbouring control rotations, and its Jacobians by their right perturbations."""
 
     vector: Float[Array, "K1 3"]
     by_left: Float[Array, "K1 3 3"]
@@ -133,8 +133,8 @@ class PoseSpline(eqx.Module):
         index = jnp.clip(jnp.floor(position), 0, self.num_intervals - 1).astype(int)
         return index, jnp.clip(position - index, 0.0, 1.0)
 
-    def evaluate(self, t: Float[Array, " n"]) -> tuple[Array, Array, Array, Array, Array]:
-        """R (n, 3, 3), p (n, 3), body angular velocity (n, 3), velocity (n, 3) and acceleration (n, 3) at times (n,)."""
+    def evaluate(self, t: Float[Array, " n"]) -> tuple[Array, ...]:
+        """R (n, 3, 3), p, body angular velocity, velocity and acceleration, each (n, 3), at times (n,)."""
         index, u = self.locate(t)
         chain = increments(self.rotations)
         matrix = basis_matrix(self.order)

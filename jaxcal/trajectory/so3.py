@@ -5,7 +5,6 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-
 # _LEVI_CIVITA[i, j, k]: a x b = sum_jk eps[i, j, k] b_j a_k, so that hat(a) = eps @ a.
 _LEVI_CIVITA = np.zeros((3, 3, 3))
 for _i, _j, _k in [(0, 1, 2), (1, 2, 0), (2, 0, 1)]:
