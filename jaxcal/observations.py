@@ -206,6 +206,15 @@ class ImuRecording:
         return self.noise.update_rate or 1e9 / float(np.median(np.diff(self.timestamps_ns)))
 
 
+def _indices(name: str, values: np.ndarray) -> np.ndarray:
+    values = np.asarray(values)
+    _require(
+        values.dtype.kind in "iu" or values.size == 0,
+        f"Detections: `{name}` has type {values.dtype}; expected whole numbers.",
+    )
+    return values.astype(np.int64)
+
+
 @dataclass(frozen=True)
 class Detections:
     """Target corners that one camera saw.
@@ -231,10 +240,14 @@ class Detections:
             f"Detections: timestamps have type {times.dtype}; give int64 nanoseconds (not float seconds).",
         )
         object.__setattr__(self, "timestamps_ns", times.astype(np.int64))
-        frame = np.asarray(self.frame, dtype=np.int64)
-        point = np.asarray(self.point, dtype=np.int64)
-        pixels = np.asarray(self.pixels, dtype=np.float64).reshape(-1, 2)
+        frame, point = _indices("frame", self.frame), _indices("point", self.point)
         m = len(frame)
+        pixels = np.asarray(self.pixels, dtype=np.float64)
+        _require(
+            pixels.size == 0 or (pixels.ndim == 2 and pixels.shape[1] == 2),
+            f"Detections: pixels have shape {pixels.shape}; expected {(m, 2)}.",
+        )
+        pixels = pixels.reshape(-1, 2)
         _require(
             len(point) == m and len(pixels) == m,
             f"Detections: frame, point and pixels have {m}, {len(point)} and {len(pixels)} rows; they must be equal.",
@@ -293,11 +306,14 @@ class Detections:
         try:
             # Opened here, because numpy leaves a file open that turns out to be damaged.
             with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
-                fields = {name: data[name] for name in ("timestamps_ns", "frame", "point", "pixels", "image_size")}
+                fields = {name: data[name] for name in ("timestamps_ns", "frame", "point", "pixels")}
+                width, height = (int(value) for value in data["image_size"])
         except Exception as error:
             raise CalibrationError(
                 f"{path}: not a detections file ({error}). Expected an npz with timestamps_ns, frame, point, pixels "
                 "and image_size; delete it and detect again."
             ) from error
-        width, height = (int(v) for v in fields.pop("image_size"))
-        return cls(**fields, image_size=(width, height))
+        try:
+            return cls(**fields, image_size=(width, height))
+        except CalibrationError as error:
+            raise CalibrationError(f"{path}: {error}") from error
