@@ -1,5 +1,6 @@
 """The engine: block-arrow least squares. Knows nothing of cameras or IMUs."""
 
+from jaxcal.estimation.adjoint import GaussNewtonAdjoint
 from jaxcal.estimation.block_arrow import (
     BlockArrow,
     BlockArrowFactor,
@@ -20,6 +21,7 @@ __all__ = [
     "BlockArrowLevenbergMarquardt",
     "BlockArrowProblem",
     "BlockStep",
+    "GaussNewtonAdjoint",
     "SolveResult",
     "State",
     "band_from_windows",

@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 
 def huber(squared: Float[Array, "*shape"], width: Float[Array, ""] | float) -> tuple[Array, Array]:
-    """Huber's loss (Huber 1964) of s = r'r: (rho, weight), rho = s inside `width` and 2 width sqrt(s) - width^2 outside.
+    """Huber's loss (Huber 1964) of s = r'r: (rho, weight); rho = s inside `width`, 2 width sqrt(s) - width^2 beyond.
 
     `weight` is drho/ds, the factor of iteratively re-weighted least squares; an infinite `width` is plain least
     squares.

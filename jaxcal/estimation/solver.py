@@ -1,9 +1,11 @@
 """Levenberg-Marquardt on block-arrow problems, as an optimistix least-squares solver."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import optimistix as optx
@@ -145,6 +147,13 @@ def _next_damping(
     return new, jnp.where(accept, 2.0, jnp.minimum(2.0 * raise_by, 1e4))
 
 
+class _NoAdjoint(optx.AbstractAdjoint):
+    """Run the loop, and offer no derivatives of it."""
+
+    def apply(self, primal_fn: Callable[..., Any], rewrite_fn: Any, inputs: Any, tags: Any) -> Any:
+        return primal_fn((*inputs, functools.partial(eqxi.while_loop, kind="lax")))
+
+
 class SolveResult(eqx.Module):
     """The optimum, and how it was reached."""
 
@@ -161,15 +170,24 @@ def solve(
     *,
     solver: BlockArrowLevenbergMarquardt | None = None,
     max_steps: int = 100,
+    adjoint: optx.AbstractAdjoint | None = None,
 ) -> SolveResult:
-    """Minimise a block-arrow problem from `state`; one compiled program per problem shape."""
+    """Minimise a block-arrow problem from `state`; one compiled program per problem shape.
+
+    With `adjoint=GaussNewtonAdjoint()` the optimum can be differentiated by the problem's arrays (its data).
+    """
+    solver = solver or BlockArrowLevenbergMarquardt()
     with single_threaded_blas():
-        return jax.block_until_ready(_solve(problem, state, solver or BlockArrowLevenbergMarquardt(), max_steps))
+        return jax.block_until_ready(_solve(problem, state, solver, max_steps, adjoint))
 
 
 @eqx.filter_jit
 def _solve(
-    problem: BlockArrowProblem, state: State, solver: BlockArrowLevenbergMarquardt, max_steps: int
+    problem: BlockArrowProblem,
+    state: State,
+    solver: BlockArrowLevenbergMarquardt,
+    max_steps: int,
+    adjoint: optx.AbstractAdjoint | None,
 ) -> SolveResult:
 
     # optimistix traces the residual function, which this solver never evaluates: it works on normal equations.
@@ -183,7 +201,7 @@ def _solve(
         options={"problem": problem},
         max_steps=max_steps,
         throw=False,
-        adjoint=optx.RecursiveCheckpointAdjoint(),
+        adjoint=adjoint or _NoAdjoint(),
     )
     stats = solution.stats
     return SolveResult(solution.value, stats["equations"], stats["history"], stats["iterations"], stats["converged"])
