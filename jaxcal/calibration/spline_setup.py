@@ -62,9 +62,9 @@ def choose_knot_rate(time_s: np.ndarray, gyro: np.ndarray, accel: np.ndarray, or
         ]
         scores.append(errors)
     table = np.array(scores)
-    best = table.min(axis=0)
-    dense_enough = np.all(table <= _ENOUGH * best, axis=1)
-    return float(rates[int(np.argmax(dense_enough))])
+    # Each sensor asks for its own sparsest sufficient rate; the spline has to serve both.
+    dense_enough = table <= _ENOUGH * table.min(axis=0)
+    return float(rates[int(np.max(np.argmax(dense_enough, axis=0)))])
 
 
 def _held_back_error(time_s: np.ndarray, values: np.ndarray, rate: float, degree: int) -> float:
