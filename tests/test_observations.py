@@ -91,8 +91,9 @@ def test_kalibrs_names_build_the_same_noise() -> None:
 def test_densities_must_be_positive(name: str, value: float | None) -> None:
     fields: dict[str, Any] = {"gyro_noise_density": 1e-3, "gyro_random_walk": 1e-5}
     fields |= {"accel_noise_density": 1e-2, "accel_random_walk": 1e-4}
+    fields[name] = value
     with pytest.raises(CalibrationError, match=f"ImuNoise: {name} is {value}; a positive density is needed"):
-        ImuNoise(**(fields | {name: value}))
+        ImuNoise(**fields)
 
 
 def test_other_mistakes_in_the_noise() -> None:
@@ -249,7 +250,8 @@ def test_a_file_whose_content_is_wrong_is_named(tmp_path: Path) -> None:
     np.savez(path, frame=np.array([0, 0, 7]), **fields)
     with pytest.raises(CalibrationError, match=r"edited.npz: .*`frame` must index the 3 timestamps"):
         Detections.load(path)
-    np.savez(path, frame=made.frame, **(fields | {"image_size": np.array([640, 480, 1])}))
+    fields["image_size"] = np.array([640, 480, 1])
+    np.savez(path, frame=made.frame, **fields)
     with pytest.raises(CalibrationError, match=r"edited.npz: .*not a detections file"):
         Detections.load(path)
 

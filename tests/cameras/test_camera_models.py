@@ -41,7 +41,8 @@ def make(name: str, bend: float) -> CameraModel:
     return camera_model(name).create(INTRINSICS, bend * np.asarray(LENSES[name][0]))
 
 
-def ray_at(angle: float, azimuth: float) -> np.ndarray:
+def ray_at(angle: Any, azimuth: Any) -> np.ndarray:
+    """Unit vectors (3, ...) at an angle from the optical axis, rad."""
     return np.array([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)])
 
 
