@@ -64,8 +64,8 @@ def robust_fit(
 
     Rounds: Huber's loss with `first_sigmas`; Huber's loss with the noise found (median); the same with each view
     weighted by what it adds (`redundancy`); plain least squares on the inliers; the same with the noise of the inliers
-    (root mean square). `usable[c]` (F,) are the frames that may take part; `pose_parameters[c]` how many parameters of
-    the trajectory a camera's corners pay for, for the degrees of freedom.
+    (root mean square) and the inliers chosen anew. `usable[c]` (F,) are the frames that may take part;
+    `pose_parameters[c]` how many parameters of the trajectory a camera's corners pay for, for the degrees of freedom.
     """
     layout = problem.layout
     seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]
@@ -96,6 +96,9 @@ def robust_fit(
         if stage >= 3:
             parameters = [n + p for n, p in zip(layout.sizes, pose_parameters, strict=True)]
             sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(errors, kept, parameters, strict=True)]
+        if stage == 3:
+            # Good corners that outliers in the same view had pulled away are taken back.
+            kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(errors, seen, sigmas, strict=True)]
         logger.info(
             "round %d: cost %.6g after %d iterations, corner noise %s px",
             stage,
