@@ -64,7 +64,9 @@ def assert_equations_match(problem: RigProblem, state: RigState, rng: np.random.
     residuals, moved = np.asarray(JV[0][0]), np.stack([np.asarray(m) for _, m in JV])
     held = (V * ~free) @ (V * ~free).T
     np.testing.assert_allclose(V @ HV.T, moved @ moved.T + held, atol=1e-10 * len(free))
-    np.testing.assert_allclose(V @ gradient, moved @ residuals, atol=1e-11 * len(free) * np.linalg.norm(residuals))
+    np.testing.assert_allclose(
+        V @ gradient, moved @ residuals, atol=1e-11 * len(free) * float(np.linalg.norm(residuals))
+    )
     np.testing.assert_array_equal(gradient[~free], 0.0)
     np.testing.assert_array_equal(diagonal[~free], 1.0)
     assert float(equations.cost) == pytest.approx(0.5 * float(residuals @ residuals), rel=1e-12)

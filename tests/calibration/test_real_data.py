@@ -43,7 +43,7 @@ EUROC_T_IMU_CAM0 = np.array(
 def test_opencv_left_camera(data_folder: Path) -> None:
     """OpenCV publishes an RMS of 0.393 px for these thirteen images; on our corners it finds the lens that we find."""
     paths = sorted((data_folder / "opencv_stereo").glob("left*.jpg"))
-    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths]
+    images = [np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in paths]
     board = Checkerboard(rows=6, cols=9, spacing=1.0)
     detections = detect(Frames(np.arange(len(images)), images, (640, 480)), board, workers=1)
     calibration = calibrate_cameras([detections], board)
