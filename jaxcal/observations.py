@@ -208,8 +208,9 @@ class ImuRecording:
 
 def _indices(name: str, values: np.ndarray) -> np.ndarray:
     values = np.asarray(values)
+    whole = values.dtype.kind in "iu" or (values.dtype.kind == "f" and bool(np.all(values == np.floor(values))))
     _require(
-        values.dtype.kind in "iu" or values.size == 0,
+        whole or values.size == 0,
         f"Detections: `{name}` has type {values.dtype}; expected whole numbers.",
     )
     return values.astype(np.int64)
