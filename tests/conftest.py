@@ -4,11 +4,6 @@ import os
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
-
-# The same examples in every run: what passes here passes in CI.
-settings.register_profile("repeatable", derandomize=True)
-settings.load_profile("repeatable")
 
 
 def _data_folder() -> Path | None:
