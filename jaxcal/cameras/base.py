@@ -14,7 +14,10 @@ from jaxtyping import Array, Float
 
 from jaxcal.errors import CalibrationError
 
-_UNPROJECT_STEPS = 20
+_UNPROJECT_STEPS = 12
+_START_ANGLES = 40
+_WIDEST = 0.98 * np.pi
+_STEP_LENGTHS = np.array([1.0, 0.5, 0.2, 0.05, 0.0])
 
 
 class CameraModel(eqx.Module):
@@ -24,13 +27,20 @@ class CameraModel(eqx.Module):
     and printed. It writes `project` for ONE point of shape (3,), in JAX, returning pixels of shape (2,); `project` of
     any subclass then also accepts arrays of points (..., 3), of jax, numpy or lists. The first `num_intrinsics` scalars
     of the parameter vector are reported as `intrinsics` (Kalibr: fx, fy, cx, cy for a pinhole), the others as
-    `distortion`. A model with a closed form for `unproject` writes that for one pixel, likewise.
+    `distortion`, by `projection_names` and `distortion_names` where a model gives them. A model with a closed form for
+    `unproject` writes that for one pixel, likewise.
 
-    Where a point cannot be projected (behind a pinhole, say) `project` may return anything, and `is_valid` says so.
+    Where a point cannot be projected (behind a pinhole, say) `project` may return any pixel that is finite and has
+    finite derivatives, and `is_valid` says so.
+
+    `held` are the places in the parameter vector that are never estimated, because others stand for them.
     """
 
     name: ClassVar[str] = ""
     num_intrinsics: ClassVar[int] = 4
+    projection_names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy")
+    distortion_names: ClassVar[tuple[str, ...]] = ()
+    held: ClassVar[tuple[int, ...]] = ()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -88,6 +98,24 @@ class CameraModel(eqx.Module):
         """The distortion coefficients (may be empty)."""
         return self.parameters[self.num_intrinsics :]
 
+    @property
+    def parameter_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Names of the intrinsics and of the distortion; i1, i2 .. and d1, d2 .. where the model gives no names."""
+        rest = self.num_parameters - self.num_intrinsics
+        intrinsics, distortion = self.projection_names, self.distortion_names
+        if len(intrinsics) != self.num_intrinsics:
+            intrinsics = tuple(f"i{k + 1}" for k in range(self.num_intrinsics))
+        if len(distortion) != rest:
+            distortion = tuple(f"d{k + 1}" for k in range(rest))
+        return intrinsics, distortion
+
+    def regularisation(self) -> Float[Array, " n"]:
+        """Information (n,), 1 / sigma^2, of a weak prior that draws each parameter to its value in `from_focal`.
+
+        Zero for parameters that every usable recording determines: all those of a model that does not say otherwise.
+        """
+        return jnp.zeros(self.num_parameters)
+
     @classmethod
     def create(cls, intrinsics: Any, distortion: Any = ()) -> "CameraModel":
         """Build the model from its intrinsics and distortion, as a Kalibr yaml gives them.
@@ -111,35 +139,73 @@ class CameraModel(eqx.Module):
 
     # --- what follows from `project` ---------------------------------------------------------------------------------
 
+    def paraxial(self) -> tuple[Float[Array, "2 2"], Float[Array, "2"]]:
+        """The lens near its axis: pixels per radian (2, 2) and the pixel (2,) of the axis, whatever the parameters are.
+
+        For a pinhole the matrix is diag(fx, fy) and the pixel (cx, cy).
+        """
+        axis = jnp.array([0.0, 0.0, 1.0])
+        return jax.jacfwd(self.project)(axis)[:, :2], self.project(axis)
+
     def unproject(self, pixel: Any) -> Float[Array, "*batch 3"]:
         """Rays (..., 3) of unit length through pixels (..., 2): Gauss-Newton on `project`, on the unit sphere.
 
-        Raises CalibrationError when the last axis is not 2.
+        Where a pixel belongs to no point the ray of a pixel close to it comes back. Derivatives by pixel and by
+        parameters are those of the implicit function. Raises CalibrationError when the last axis is not 2.
         """
         return _batched(_unproject, 2)(self, pixel)
 
 
 @eqx.filter_jit
 def _unproject(model: CameraModel, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
-    focal, centre = model.intrinsics[:2], model.intrinsics[2:4]
-    tangent = (pixel - centre) / focal
-    radius = jnp.sqrt(tangent @ tangent + 1e-30)
-    start = jnp.append(jnp.sin(radius) / radius * tangent, jnp.cos(radius))
-    # Points outside the forward half start on its rim: the equidistant guess is meant for fisheyes.
-    start = jnp.where(radius < 1.4, start, jnp.append(tangent / radius, 0.15))
+    fixed = jax.tree.map(jax.lax.stop_gradient, model)
+    wanted = jax.lax.stop_gradient(pixel)
+    ray = jax.lax.fori_loop(0, _UNPROJECT_STEPS, lambda _, ray: _closer(fixed, wanted, ray), _start(fixed, wanted))
+    # One undamped step more: it carries the derivatives, which are then those of the implicit function.
+    moved = ray + _newton_step(model, pixel, jax.lax.stop_gradient(ray))
+    return moved / jnp.linalg.norm(moved)
 
-    def step(_: Any, ray: Array) -> Array:
-        error = model.project(ray) - pixel
-        jacobian = jax.jacfwd(model.project)(ray)
-        # Minimum-norm step; the radial direction is in the null space of the projection's Jacobian.
-        gram = jacobian @ jacobian.T
-        delta = -jacobian.T @ jnp.linalg.solve(gram + 1e-12 * jnp.trace(gram) * jnp.eye(2), error)
-        # The constant keeps the gradient finite where the step is zero.
-        delta = delta * jnp.minimum(1.0, 0.3 / jnp.sqrt(delta @ delta + 1e-30))
-        moved = ray + delta
-        return moved / jnp.linalg.norm(moved)
 
-    return jax.lax.fori_loop(0, _UNPROJECT_STEPS, step, start / jnp.linalg.norm(start))
+def _start(model: CameraModel, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
+    """A ray near the one wanted: on the pixel's side of the axis, at the angle where the image first is as far out."""
+    scale, centre = model.paraxial()
+    arm = pixel - centre
+    azimuth = jnp.linalg.solve(scale, arm)
+    azimuth = azimuth / jnp.sqrt(azimuth @ azimuth + 1e-30)
+    angles = jnp.linspace(0.0, _WIDEST, _START_ANGLES)
+    rays = jnp.concatenate([jnp.sin(angles)[:, None] * azimuth, jnp.cos(angles)[:, None]], axis=1)
+    reach = jax.vmap(lambda ray: (model.project(ray) - centre) @ arm)(rays) / jnp.sqrt(arm @ arm + 1e-30)
+    valid = jax.vmap(model.is_valid)(rays)
+    missing = reach - jnp.sqrt(arm @ arm + 1e-30)
+    # The axis is valid in any lens. Behind the first angle that is far enough out lies a fold, or the rear.
+    beyond = (missing >= 0.0) & valid
+    far = jnp.argmax(beyond)
+    near = jnp.maximum(far - 1, 0)
+    share = jnp.clip(-missing[near] / jnp.maximum(missing[far] - missing[near], 1e-30), 0.0, 1.0)
+    between = angles[near] + share * (angles[far] - angles[near])
+    widest = angles[jnp.argmax(jnp.where(valid, reach, -jnp.inf))]
+    angle = jnp.where(jnp.any(beyond), between, widest)
+    return jnp.append(jnp.sin(angle) * azimuth, jnp.cos(angle))
+
+
+def _newton_step(model: CameraModel, pixel: Float[Array, "2"], ray: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The smallest change of a ray that brings its projection to the pixel, to first order."""
+    error = model.project(ray) - pixel
+    jacobian = jax.jacfwd(model.project)(ray)
+    # The radial direction is in the null space of the projection's Jacobian, so a minimum-norm step is wanted.
+    gram = jacobian @ jacobian.T
+    return -jacobian.T @ jnp.linalg.solve(gram + 1e-12 * jnp.trace(gram) * jnp.eye(2) + 1e-30 * jnp.eye(2), error)
+
+
+def _closer(model: CameraModel, pixel: Float[Array, "2"], ray: Float[Array, "3"]) -> Float[Array, "3"]:
+    """A Newton step from a ray, of the length (full, half, ... or none) that comes closest to the pixel."""
+    step = _newton_step(model, pixel, ray)
+    step = step * jnp.minimum(1.0, 0.3 / jnp.sqrt(step @ step + 1e-30))
+    moved = ray + _STEP_LENGTHS[:, None] * step
+    moved = moved / jnp.linalg.norm(moved, axis=1, keepdims=True)
+    errors = jax.vmap(lambda ray: jnp.sum((model.project(ray) - pixel) ** 2))(moved)
+    errors = jnp.where(jax.vmap(model.is_valid)(moved), errors, jnp.inf)
+    return moved[jnp.argmin(errors)]
 
 
 def _batched(of_one: Callable[[Any, Array], Array], size: int) -> Callable[[Any, Any], Array]:

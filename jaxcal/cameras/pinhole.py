@@ -1,31 +1,46 @@
-"""Pinhole projection, with a distortion applied on the normalised image plane."""
+"""Pinhole projection, with a distortion applied on the normalised image plane: what lies in front of the camera."""
 
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxcal.cameras import distortions
 from jaxcal.cameras.base import CameraModel
-from jaxcal.cameras.distortions import equidistant, no_distortion, radtan
+from jaxcal.cameras.numerics import at_least, length, rises_until
+
+# Closer to the image plane than this angle (rad) nothing is projected: pixels there are a million focal lengths out.
+_RIM = 1e-6
 
 
-class _Pinhole(CameraModel):
+class PinholeModel(CameraModel):
     """Pinhole camera: u = fx x' + cx, v = fy y' + cy with (x', y') the distorted (x/z, y/z)."""
 
     focal: Float[Array, "2"]
     centre: Float[Array, "2"]
     coefficients: Float[Array, " d"]
 
-    num_coefficients: ClassVar[int] = 0
-
     def _distort(self, plane: Float[Array, "2"]) -> Float[Array, "2"]:
         raise TypeError(f"{type(self).__name__} defines no distortion")  # the base is never built
+
+    def _radial(self, r2: Float[Array, ""]) -> Float[Array, ""]:
+        """The radial factor of the distortion at a squared radius."""
+        return jnp.ones_like(r2)
 
     def project(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
         """Pixel (2,) of a point (3,) in the camera frame, metres."""
         # Points at or behind the image plane get a finite, far value; `is_valid` masks them.
-        depth = jnp.where(point[2] > 1e-6, point[2], 1e-6)
-        return self.focal * self._distort(point[:2] / depth) + self.centre
+        return self.focal * self._distort(point[:2] / at_least(point[2], _RIM)) + self.centre
+
+    def is_valid(self, point: Float[Array, "3"]) -> Any:
+        """Whether a point (3,) lies in front, nearer to the axis than where the radial distortion folds back."""
+        angle = jnp.arctan2(length(point[:2]), point[2])
+
+        def radius(angle: Float[Array, ""]) -> Float[Array, ""]:
+            undistorted = jnp.tan(angle)
+            return undistorted * self._radial(undistorted**2)
+
+        return rises_until(radius, angle, limit=jnp.pi / 2.0 - _RIM)
 
     @classmethod
     def from_focal(cls, focal: float, image_size: tuple[int, int]) -> "CameraModel":
@@ -33,37 +48,84 @@ class _Pinhole(CameraModel):
         return cls(
             focal=jnp.full(2, float(focal)),
             centre=jnp.array([(width - 1) / 2.0, (height - 1) / 2.0]),
-            coefficients=jnp.zeros(cls.num_coefficients),
+            coefficients=jnp.zeros(len(cls.distortion_names)),
         )
 
 
-class Pinhole(_Pinhole):
+class Pinhole(PinholeModel):
     """`pinhole-none`: fx, fy, cx, cy."""
 
     name: ClassVar[str] = "pinhole-none"
 
     def _distort(self, plane: Float[Array, "2"]) -> Float[Array, "2"]:
-        return no_distortion(plane)
+        return distortions.no_distortion(plane)
+
+    def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
+        """The ray (3,) of unit length through a pixel (2,)."""
+        ray = jnp.append((pixel - self.centre) / self.focal, 1.0)
+        return ray / jnp.linalg.norm(ray)
 
 
-class PinholeRadtan(_Pinhole):
+class PinholeRadtan(PinholeModel):
     """`pinhole-radtan`: fx, fy, cx, cy; k1, k2, p1, p2 (Brown 1966, as in OpenCV's first four coefficients)."""
 
     name: ClassVar[str] = "pinhole-radtan"
-    num_coefficients: ClassVar[int] = 4
+    distortion_names: ClassVar[tuple[str, ...]] = ("k1", "k2", "p1", "p2")
 
     def _distort(self, plane: Float[Array, "2"]) -> Float[Array, "2"]:
-        return radtan(plane, self.coefficients)
+        return distortions.radtan(plane, self.coefficients)
+
+    def _radial(self, r2: Float[Array, ""]) -> Float[Array, ""]:
+        return distortions.radtan_radial(r2, self.coefficients)
 
 
-class PinholeEquidistant(_Pinhole):
-    """`pinhole-equi`: fx, fy, cx, cy; k1..k4 (Kannala & Brandt 2006, as in OpenCV's fisheye module)."""
+class PinholeRadtan5(PinholeModel):
+    """`pinhole-radtan5`: fx, fy, cx, cy; k1, k2, p1, p2, k3 (OpenCV's first five coefficients)."""
 
-    name: ClassVar[str] = "pinhole-equi"
-    num_coefficients: ClassVar[int] = 4
+    name: ClassVar[str] = "pinhole-radtan5"
+    distortion_names: ClassVar[tuple[str, ...]] = ("k1", "k2", "p1", "p2", "k3")
 
     def _distort(self, plane: Float[Array, "2"]) -> Float[Array, "2"]:
-        return equidistant(plane, self.coefficients)
+        return distortions.radtan5(plane, self.coefficients)
+
+    def _radial(self, r2: Float[Array, ""]) -> Float[Array, ""]:
+        return distortions.radtan5_radial(r2, self.coefficients)
 
 
-BUILT_IN: tuple[type[Any], ...] = (Pinhole, PinholeRadtan, PinholeEquidistant)
+class PinholeRational8(PinholeModel):
+    """`pinhole-rational8`: fx, fy, cx, cy; k1, k2, p1, p2, k3, k4, k5, k6 (OpenCV's CALIB_RATIONAL_MODEL)."""
+
+    name: ClassVar[str] = "pinhole-rational8"
+    distortion_names: ClassVar[tuple[str, ...]] = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+    def _distort(self, plane: Float[Array, "2"]) -> Float[Array, "2"]:
+        return distortions.rational8(plane, self.coefficients)
+
+    def _radial(self, r2: Float[Array, ""]) -> Float[Array, ""]:
+        return distortions.rational8_radial(r2, self.coefficients)
+
+
+class PinholeThinPrism12(PinholeModel):
+    """`pinhole-thinprism12`: as `pinhole-rational8`, then s1, s2, s3, s4 (OpenCV's CALIB_THIN_PRISM_MODEL)."""
+
+    name: ClassVar[str] = "pinhole-thinprism12"
+    distortion_names: ClassVar[tuple[str, ...]] = (*PinholeRational8.distortion_names, "s1", "s2", "s3", "s4")
+
+    def _distort(self, plane: Float[Array, "2"]) -> Float[Array, "2"]:
+        return distortions.thin_prism12(plane, self.coefficients)
+
+    def _radial(self, r2: Float[Array, ""]) -> Float[Array, ""]:
+        return distortions.rational8_radial(r2, self.coefficients)
+
+
+class PinholeTilted14(PinholeModel):
+    """`pinhole-tilted14`: as `pinhole-thinprism12`, then tau_x, tau_y (OpenCV's CALIB_TILTED_MODEL)."""
+
+    name: ClassVar[str] = "pinhole-tilted14"
+    distortion_names: ClassVar[tuple[str, ...]] = (*PinholeThinPrism12.distortion_names, "tau_x", "tau_y")
+
+    def _distort(self, plane: Float[Array, "2"]) -> Float[Array, "2"]:
+        return distortions.tilted14(plane, self.coefficients)
+
+    def _radial(self, r2: Float[Array, ""]) -> Float[Array, ""]:
+        return distortions.rational8_radial(r2, self.coefficients)

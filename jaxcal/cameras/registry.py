@@ -3,11 +3,35 @@
 import difflib
 import importlib
 
-from jaxcal.cameras import pinhole
 from jaxcal.cameras.base import CameraModel
+from jaxcal.cameras.ds import DoubleSphere
+from jaxcal.cameras.eucm import Eucm
+from jaxcal.cameras.kannala_brandt import PinholeEquidistant
+from jaxcal.cameras.omni import Omni, OmniRadtan
+from jaxcal.cameras.pinhole import (
+    Pinhole,
+    PinholeRadtan,
+    PinholeRadtan5,
+    PinholeRational8,
+    PinholeThinPrism12,
+    PinholeTilted14,
+)
 from jaxcal.errors import CalibrationError
 
-_MODELS: dict[str, type[CameraModel]] = {model.name: model for model in pinhole.BUILT_IN}
+_BUILT_IN: tuple[type[CameraModel], ...] = (
+    Pinhole,
+    PinholeRadtan,
+    PinholeRadtan5,
+    PinholeRational8,
+    PinholeThinPrism12,
+    PinholeTilted14,
+    PinholeEquidistant,
+    Omni,
+    OmniRadtan,
+    Eucm,
+    DoubleSphere,
+)
+_MODELS: dict[str, type[CameraModel]] = {model.name: model for model in _BUILT_IN}
 
 
 def names() -> list[str]:

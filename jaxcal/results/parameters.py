@@ -6,15 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxcal.cameras import CameraModel, model_name
+from jaxcal.cameras import CameraModel
 from jaxcal.results.calibration import Calibration
-
-_PROJECTION_NAMES = {
-    "omni": ("xi", "fx", "fy", "cx", "cy"),
-    "eucm": ("alpha", "beta", "fx", "fy", "cx", "cy"),
-    "ds": ("xi", "alpha", "fx", "fy", "cx", "cy"),
-}
-_DISTORTION_NAMES = {"radtan": ("k1", "k2", "p1", "p2"), "equi": ("k1", "k2", "k3", "k4"), "fov": ("w",)}
 
 
 @dataclass(frozen=True)
@@ -34,15 +27,7 @@ def sigma_of(calibration: Calibration, block: str) -> np.ndarray | None:
 
 def parameter_names(model: CameraModel) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of a model's intrinsics and of its distortion coefficients, in the order of its parameters."""
-    projection, _, lens = model_name(model).partition("-")
-    count, rest = model.num_intrinsics, model.num_parameters - model.num_intrinsics
-    intrinsics = _PROJECTION_NAMES.get(projection, ("fx", "fy", "cx", "cy"))
-    if len(intrinsics) != count:
-        intrinsics = tuple(f"i{k + 1}" for k in range(count))
-    distortion = _DISTORTION_NAMES.get(lens, ())
-    if len(distortion) != rest:
-        distortion = tuple(f"d{k + 1}" for k in range(rest))
-    return intrinsics, distortion
+    return model.parameter_names
 
 
 def camera_estimates(calibration: Calibration, index: int) -> list[Estimate]:
