@@ -1,21 +1,13 @@
 """Checkerboard and AprilGrid."""
 
-import numbers
 from dataclasses import dataclass
 
 import numpy as np
 
 from jaxcal.errors import CalibrationError
-from jaxcal.targets.base import Target
+from jaxcal.targets.base import Target, check_fields, check_id, grid_points, grid_turns
 
-
-def _check(name: str, counts: dict[str, int], lengths: dict[str, float]) -> None:
-    for key, count in counts.items():
-        if not isinstance(count, numbers.Integral) or count < 1:
-            raise CalibrationError(f"{name}: {key} is {count}; expected a whole number, at least 1.")
-    for key, length in lengths.items():
-        if not isinstance(length, numbers.Real) or not np.isfinite(length) or length <= 0:
-            raise CalibrationError(f"{name}: {key} is {length}; expected a positive length.")
+TAGS_IN_FAMILY = 587  # of 36h11
 
 
 @dataclass(frozen=True)
@@ -31,11 +23,11 @@ class Checkerboard(Target):
     col_spacing: float | None = None
 
     def __post_init__(self) -> None:
-        _check("Checkerboard", {"rows": self.rows, "cols": self.cols}, {"spacing": self.spacing})
+        check_fields("Checkerboard", {"rows": self.rows, "cols": self.cols}, {"spacing": self.spacing})
         if self.col_spacing is None:
             # One way to say it, so that a board equals itself after a round trip through yaml.
             object.__setattr__(self, "col_spacing", self.spacing)
-        _check("Checkerboard", {}, {"col_spacing": self.col_spacing or 0.0})
+        check_fields("Checkerboard", {}, {"col_spacing": self.col_spacing or 0.0})
         if min(self.rows, self.cols) < 2:
             raise CalibrationError("Checkerboard: at least 2 x 2 inner corners are needed; count the INNER corners.")
 
@@ -45,17 +37,15 @@ class Checkerboard(Target):
 
     @property
     def points(self) -> np.ndarray:
-        y, x = np.mgrid[: self.rows, : self.cols].astype(np.float64)
-        dx = self.col_spacing or self.spacing
-        return np.stack([x * dx, y * self.spacing, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+        return grid_points(self.rows, self.cols, self.spacing, self.col_spacing or self.spacing)
 
     @property
-    def is_half_turn_symmetric(self) -> bool:
-        """Whether the board looks the same after half a turn, so that its orientation cannot be read off one image.
-
-        With rows + cols odd the two ends differ in colour; otherwise half a turn maps black on black.
-        """
-        return (self.rows + self.cols) % 2 == 0
+    def turns(self) -> np.ndarray:
+        # With rows + cols odd the two ends differ in colour; otherwise half a turn maps black on black. A square
+        # board with an odd number of squares along its side has the same colour at all four ends.
+        half = (self.rows + self.cols) % 2 == 0
+        square = self.rows == self.cols and self.spacing == self.col_spacing
+        return grid_turns(self.rows, self.cols, half, quarter=square and self.rows % 2 == 0)
 
     def to_yaml(self) -> dict[str, object]:
         return {
@@ -73,24 +63,37 @@ class AprilGrid(Target):
 
     `tag_size` is a tag's edge in metres, `tag_spacing` the gap between tags as a fraction of the edge. Point index =
     row * 2 cols + column over the grid of tag corners, from the lower left, as Kalibr numbers them; tag k sits at
-    tag row k // cols from below, tag column k % cols.
+    tag row k // cols from below, tag column k % cols. Its printed id is `first_id` + k: boards that are seen together
+    need different ids (0 in Kalibr, which knows no other; yaml key `firstTagId`).
     """
 
     rows: int
     cols: int
     tag_size: float
     tag_spacing: float
+    first_id: int = 0
 
     def __post_init__(self) -> None:
-        _check(
+        check_fields(
             "AprilGrid",
             {"rows": self.rows, "cols": self.cols},
             {"tag_size": self.tag_size, "tag_spacing": self.tag_spacing},
         )
-        if self.rows * self.cols > 587:
+        check_id("AprilGrid", "first_id", self.first_id)
+        if self.rows * self.cols > TAGS_IN_FAMILY:
             raise CalibrationError(
-                f"AprilGrid: {self.rows * self.cols} tags; the family 36h11 has 587. Use a smaller grid."
+                f"AprilGrid: {self.rows * self.cols} tags; the family 36h11 has {TAGS_IN_FAMILY}. Use a smaller grid."
             )
+        if self.first_id + self.rows * self.cols > TAGS_IN_FAMILY:
+            raise CalibrationError(
+                f"AprilGrid: ids {self.first_id} to {self.ids[-1]}; the family 36h11 ends at {TAGS_IN_FAMILY - 1}. "
+                "Use a smaller first_id."
+            )
+
+    @property
+    def ids(self) -> range:
+        """The printed ids of its tags."""
+        return range(self.first_id, self.first_id + self.rows * self.cols)
 
     @property
     def grid_shape(self) -> tuple[int, int]:
@@ -107,20 +110,23 @@ class AprilGrid(Target):
     def tag_points(self, tag_id: int) -> np.ndarray:
         """Point indices (4,) of one tag's corners, anticlockwise from the lower left as Kalibr orders them.
 
-        Raises CalibrationError when the board has no such tag.
+        `tag_id` is the printed id. Raises CalibrationError when the board has no such tag.
         """
-        if not 0 <= tag_id < self.rows * self.cols:
-            raise CalibrationError(f"AprilGrid: tag {tag_id} is not among its {self.rows * self.cols} tags, 0 onwards.")
-        row, col = divmod(tag_id, self.cols)
+        if tag_id not in self.ids:
+            raise CalibrationError(
+                f"AprilGrid: tag {tag_id} is not among its {len(self.ids)} tags, {self.first_id} onwards."
+            )
+        row, col = divmod(tag_id - self.first_id, self.cols)
         width = 2 * self.cols
         low = 2 * row * width + 2 * col
         return np.array([low, low + 1, low + width + 1, low + width])
 
     def to_yaml(self) -> dict[str, object]:
-        return {
+        kalibr: dict[str, object] = {
             "target_type": "aprilgrid",
             "tagCols": self.cols,
             "tagRows": self.rows,
             "tagSize": self.tag_size,
             "tagSpacing": self.tag_spacing,
         }
+        return kalibr | ({"firstTagId": self.first_id} if self.first_id else {})

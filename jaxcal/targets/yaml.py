@@ -1,7 +1,8 @@
-"""Kalibr's target.yaml."""
+"""target.yaml: Kalibr's kinds of targets, and ours in the same manner."""
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,19 +10,19 @@ import yaml
 
 from jaxcal.errors import CalibrationError
 from jaxcal.targets.base import Target
+from jaxcal.targets.boards import BoardSet
+from jaxcal.targets.charuco import Charuco
+from jaxcal.targets.circles import CircleGrid
 from jaxcal.targets.grids import AprilGrid, Checkerboard
-
-_KEYS = {
-    "aprilgrid": ("tagRows", "tagCols", "tagSize", "tagSpacing"),
-    "checkerboard": ("targetRows", "targetCols", "rowSpacingMeters", "colSpacingMeters"),
-}
 
 
 def load_target(path: str | Path) -> Target:
-    """Read a Kalibr `target.yaml` (`aprilgrid` or `checkerboard`).
+    """Read a `target.yaml`: Kalibr's `aprilgrid`, `checkerboard` and `circlegrid`, and `charuco` and `boards`.
 
-    Raises CalibrationError when the file is missing, is not yaml, has an unknown or missing key or a value that is
-    not a number.
+    Beyond Kalibr's keys: an aprilgrid may have `firstTagId`, a circlegrid `circleDiameterMeters`; a charuco has
+    `squareRows`, `squareCols`, `squareSize`, `markerSize`, `dictionary` and may have `legacyPattern` and
+    `firstMarkerId`; `boards` has a list `boards` of targets. Raises CalibrationError when the file is missing, is not
+    yaml, has an unknown or missing key or a value of the wrong kind.
     """
     path = Path(path)
     try:
@@ -38,25 +39,34 @@ def target_from_yaml(content: Any, where: str) -> Target:
     if not isinstance(content, Mapping):
         raise CalibrationError(f"{where}: expected keys such as 'target_type: aprilgrid'.")
     kind = content.get("target_type")
-    if kind not in _KEYS:
-        raise CalibrationError(f"{where}: target_type is {kind!r}; known: {', '.join(_KEYS)}.")
-    keys = _KEYS[kind]
+    if not isinstance(kind, str) or kind not in _FORMATS:
+        raise CalibrationError(f"{where}: target_type is {kind!r}; known: {', '.join(_FORMATS)}.")
+    form = _FORMATS[kind]
+    known = [*form.keys, *form.optional]
     for key in content:
-        if key not in (*keys, "target_type"):
-            close = difflib.get_close_matches(str(key), keys, n=1)
+        if key not in (*known, "target_type"):
+            close = difflib.get_close_matches(str(key), known, n=1)
             hint = f" Did you mean '{close[0]}'?" if close else ""
-            raise CalibrationError(f"{where}: unknown key '{key}'.{hint} A {kind} has {', '.join(keys)}.")
-    missing = [key for key in keys if key not in content]
+            raise CalibrationError(f"{where}: unknown key '{key}'.{hint} {_having(kind)}")
+    missing = [key for key in form.keys if key not in content]
     if missing:
-        raise CalibrationError(f"{where}: '{missing[0]}' is missing. A {kind} has {', '.join(keys)}.")
-    rows, cols = (_whole(f"{where}: '{key}'", content[key]) for key in keys[:2])
-    first, second = (_number(f"{where}: '{key}'", content[key]) for key in keys[2:])
+        raise CalibrationError(f"{where}: '{missing[0]}' is missing. {_having(kind)}")
+    readers = form.keys | form.optional
+    fields = {
+        readers[key][0]: readers[key][1](f"{where}: '{key}'", value)
+        for key, value in content.items()
+        if key != "target_type"
+    }
     try:
-        if kind == "aprilgrid":
-            return AprilGrid(rows=rows, cols=cols, tag_size=first, tag_spacing=second)
-        return Checkerboard(rows=rows, cols=cols, spacing=first, col_spacing=second)
+        return form.make(**fields)
     except CalibrationError as error:
         raise CalibrationError(f"{where}: {error}") from error
+
+
+def _having(kind: str) -> str:
+    form = _FORMATS[kind]
+    optional = f", and may have {', '.join(form.optional)}" if form.optional else ""
+    return f"A {kind} has {', '.join(form.keys)}{optional}."
 
 
 def _number(place: str, value: Any) -> float:
@@ -71,3 +81,80 @@ def _whole(place: str, value: Any) -> int:
     if not number.is_integer():
         raise CalibrationError(f"{place} is {value!r}; expected a whole number.")
     return int(number)
+
+
+def _truth(place: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise CalibrationError(f"{place} is {value!r}; expected true or false.")
+    return value
+
+
+def _text(place: str, value: Any) -> str:
+    if not isinstance(value, str):
+        raise CalibrationError(f"{place} is {value!r}; expected a name.")
+    return value
+
+
+def _boards(place: str, value: Any) -> tuple[Target, ...]:
+    if not isinstance(value, list):
+        raise CalibrationError(f"{place} is {value!r}; expected a list of targets.")
+    return tuple(target_from_yaml(content, f"{place}: board {number}") for number, content in enumerate(value))
+
+
+# yaml key -> (field of the class, reader of its value).
+_Keys = dict[str, tuple[str, Callable[[str, Any], Any]]]
+
+
+@dataclass(frozen=True)
+class _Format:
+    """How a kind of target is written: the class it makes, the keys it needs and those it may have."""
+
+    make: Callable[..., Target]
+    keys: _Keys
+    optional: _Keys
+
+
+_FORMATS: dict[str, _Format] = {
+    "aprilgrid": _Format(
+        AprilGrid,
+        {
+            "tagRows": ("rows", _whole),
+            "tagCols": ("cols", _whole),
+            "tagSize": ("tag_size", _number),
+            "tagSpacing": ("tag_spacing", _number),
+        },
+        {"firstTagId": ("first_id", _whole)},
+    ),
+    "checkerboard": _Format(
+        Checkerboard,
+        {
+            "targetRows": ("rows", _whole),
+            "targetCols": ("cols", _whole),
+            "rowSpacingMeters": ("spacing", _number),
+            "colSpacingMeters": ("col_spacing", _number),
+        },
+        {},
+    ),
+    "circlegrid": _Format(
+        CircleGrid,
+        {
+            "targetRows": ("rows", _whole),
+            "targetCols": ("cols", _whole),
+            "spacingMeters": ("spacing", _number),
+            "asymmetricGrid": ("asymmetric", _truth),
+        },
+        {"circleDiameterMeters": ("diameter", _number)},
+    ),
+    "charuco": _Format(
+        Charuco,
+        {
+            "squareRows": ("rows", _whole),
+            "squareCols": ("cols", _whole),
+            "squareSize": ("square_size", _number),
+            "markerSize": ("marker_size", _number),
+            "dictionary": ("dictionary", _text),
+        },
+        {"legacyPattern": ("legacy", _truth), "firstMarkerId": ("first_id", _whole)},
+    ),
+    "boards": _Format(BoardSet, {"boards": ("boards", _boards)}, {}),
+}
