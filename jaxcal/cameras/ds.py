@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -58,3 +59,16 @@ class DoubleSphere(CameraModel):
         width, height = image_size
         centre = jnp.array([(width - 1) / 2.0, (height - 1) / 2.0])
         return cls(jnp.asarray(0.0), jnp.asarray(0.5), jnp.full(2, float(focal)), centre)
+
+    @classmethod
+    def starts(cls, focal: float, image_size: tuple[int, int]) -> tuple["CameraModel", ...]:
+        """A stereographic lens, a weaker barrel, and the middle of the lenses in the paper's table 2."""
+        first = cls.from_focal(focal, image_size)
+        return tuple(
+            eqx.tree_at(
+                lambda m: (m.xi, m.alpha, m.focal),
+                first,
+                (jnp.asarray(xi), jnp.asarray(alpha), jnp.full(2, focal * (1.0 + xi))),
+            )
+            for xi, alpha in ((0.0, 0.5), (0.0, 0.2), (-0.2, 0.6))
+        )

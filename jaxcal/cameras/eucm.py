@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -56,6 +57,12 @@ class Eucm(CameraModel):
         width, height = image_size
         centre = jnp.array([(width - 1) / 2.0, (height - 1) / 2.0])
         return cls(jnp.asarray(0.5), jnp.asarray(1.0), jnp.full(2, float(focal)), centre)
+
+    @classmethod
+    def starts(cls, focal: float, image_size: tuple[int, int]) -> tuple["CameraModel", ...]:
+        """A stereographic lens, a weaker barrel and a stronger one."""
+        first = cls.from_focal(focal, image_size)
+        return tuple(eqx.tree_at(lambda m: m.alpha, first, jnp.asarray(alpha)) for alpha in (0.5, 0.2, 0.75))
 
 
 def edge_ratio(alpha: Float[Array, ""]) -> Float[Array, ""]:

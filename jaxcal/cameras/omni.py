@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -48,6 +49,15 @@ class OmniModel(CameraModel):
             focal=jnp.full(2, 2.0 * focal),
             centre=jnp.array([(width - 1) / 2.0, (height - 1) / 2.0]),
             coefficients=jnp.zeros(len(cls.distortion_names)),
+        )
+
+    @classmethod
+    def starts(cls, focal: float, image_size: tuple[int, int]) -> tuple["CameraModel", ...]:
+        """From nearly a pinhole (small xi) to the strongest barrel."""
+        first = cls.from_focal(focal, image_size)
+        return tuple(
+            eqx.tree_at(lambda m: (m.xi, m.focal), first, (jnp.asarray(xi), jnp.full(2, focal * (1.0 + xi))))
+            for xi in (1.0, 0.3, 2.0)
         )
 
 
