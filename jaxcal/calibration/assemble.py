@@ -90,19 +90,28 @@ def round_up(count: int, step: int) -> int:
 
 
 def stack_groups(layout: SharedLayout, per_camera: Sequence[np.ndarray]) -> tuple[jnp.ndarray, ...]:
-    """One array (F_c, ...) per camera to one array per group, zero-padded to a size that is compiled often."""
+    """One array (F_c, ...) per camera to one array per group, padded to a size that is compiled often.
+
+    Each camera fills whole batches; what pads its last one are copies of its last frame (to which no weight belongs).
+    """
     stacked = []
     for members in layout.groups:
-        joined = np.concatenate([per_camera[c] for c in members])
-        padding = round_up(len(joined), FRAME_BATCH) - len(joined)
-        stacked.append(jnp.asarray(np.pad(joined, [(0, padding)] + [(0, 0)] * (joined.ndim - 1))))
+        joined = np.concatenate([_fill_batches(np.asarray(per_camera[c])) for c in members])
+        stacked.append(jnp.asarray(_pad_to(joined, round_up(len(joined), FRAME_BATCH))))
     return tuple(stacked)
+
+
+def _fill_batches(rows: np.ndarray) -> np.ndarray:
+    return _pad_to(rows, -(-len(rows) // FRAME_BATCH) * FRAME_BATCH)
+
+
+def _pad_to(rows: np.ndarray, count: int) -> np.ndarray:
+    return np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)])
 
 
 def vision_data(
     layout: SharedLayout,
     cameras: Sequence[CameraFrames],
-    target: Target,
     *,
     weights: Sequence[np.ndarray],
     views: Sequence[np.ndarray] | None = None,
@@ -115,20 +124,26 @@ def vision_data(
         "rig_camera": [np.full(n, c) for c, n in enumerate(counts)],
         "view": [np.zeros(n, dtype=np.int64) for n in counts] if views is None else views,
         "time": [np.zeros(n) for n in counts] if times is None else times,
-        "pixels": [frames.pixels for frames in cameras],
-        "weight": masked_weights(cameras, weights),
+        "pixels": [frames.pixels.swapaxes(1, 2) for frames in cameras],
     }
     stacked = {name: stack_groups(layout, values) for name, values in fields.items()}
-    points = jnp.asarray(target.points)
-    return tuple(
-        VisionData(**{name: values[g] for name, values in stacked.items()}, points=points)
-        for g in range(len(layout.groups))
-    )
+    stacked["weight"] = stack_weights(layout, cameras, weights)
+    return tuple(VisionData(**{name: values[g] for name, values in stacked.items()}) for g in range(len(layout.groups)))
 
 
-def masked_weights(cameras: Sequence[CameraFrames], weights: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Weights, zero where no corner was seen."""
-    return [np.where(frames.seen, weight, 0.0) for frames, weight in zip(cameras, weights, strict=True)]
+def stack_weights(
+    layout: SharedLayout, cameras: Sequence[CameraFrames], weights: Sequence[np.ndarray]
+) -> tuple[jnp.ndarray, ...]:
+    """Weights (F, N) of each camera's corners, zero where none was seen and in padding, per group."""
+    stacked = []
+    for members in layout.groups:
+        rows = []
+        for c in members:
+            masked = np.where(cameras[c].seen, weights[c], 0.0)
+            rows.append(np.pad(masked, [(0, -len(masked) % FRAME_BATCH), (0, 0)]))
+        joined = np.concatenate(rows)
+        stacked.append(jnp.asarray(np.pad(joined, [(0, round_up(len(joined), FRAME_BATCH) - len(joined)), (0, 0)])))
+    return tuple(stacked)
 
 
 def split_groups(
@@ -141,5 +156,5 @@ def split_groups(
         for c in members:
             count = len(cameras[c].frames)
             out[c] = np.asarray(values)[start : start + count]
-            start += count
+            start += -(-count // FRAME_BATCH) * FRAME_BATCH
     return out

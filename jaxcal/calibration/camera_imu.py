@@ -18,7 +18,8 @@ from jaxcal.calibration.outcome import calibration_from, chain_covariance_and_se
 from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.robust import RobustFit, robust_fit
 from jaxcal.calibration.spline_setup import SplineGrid
-from jaxcal.calibration.state import RigState, SharedLayout, layout_of
+from jaxcal.calibration.state import RigState, SharedLayout, flat_target, layout_of
+from jaxcal.calibration.target_shape import geometry_of
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import Detections, ImuRecording
@@ -213,12 +214,13 @@ def _problem(
         prior = _lens_prior(cameras, layout)
     return RigProblem(
         templates=solving.templates_of(lenses, layout),
-        corners=vision_data(layout, frames, target, weights=[np.ones(f.seen.shape) for f in frames], times=start.times),
+        corners=vision_data(layout, frames, weights=[np.ones(f.seen.shape) for f in frames], times=start.times),
+        geometry=geometry_of(target),
         imu=data,
         prior=prior,
         free_chain=jnp.ones((grid.intervals + grid.order - 1, 12), dtype=bool),
         free=jnp.asarray(free),
-        huber_width=jnp.asarray(1.0),
+        loss_width=jnp.asarray(1.0),
         layout=layout,
         order=grid.order,
     )
@@ -261,6 +263,7 @@ def _first_state(
         rotations=jnp.asarray(rotations),
         positions=jnp.asarray(positions),
         biases=jnp.asarray(biases),
+        target=flat_target(layout),
     )
 
 

@@ -57,7 +57,7 @@ def calibrate_cameras(
         weights=[np.ones(frames.seen.shape) for frames in cameras],
         T_cam_rig=T_cam_rig,
         T_target_rig=T_target_rig,
-        huber_width=1.0,
+        loss_width=1.0,
     )
     usable = [np.ones(len(frames.frames), dtype=bool) for frames in cameras]
     fit = robust_fit(

@@ -1,16 +1,19 @@
 """The calibration of a rig as one block-arrow least-squares problem, with or without IMU."""
 
+import functools
+
 import equinox as eqx
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.calibration import inertial, vision
 from jaxcal.calibration.inertial import InertialData
 from jaxcal.calibration.state import RigState, SharedLayout
-from jaxcal.calibration.vision import FrameEquations, FramePoses, VisionData
+from jaxcal.calibration.target_shape import TargetGeometry, points_by_target, target_points
+from jaxcal.calibration.vision import FramePoses, VisionData
 from jaxcal.cameras import CameraModel
-from jaxcal.estimation import BlockArrow, band_from_windows, chain_from_windows
+from jaxcal.estimation import BlockArrow, band_from_windows, chain_from_windows, robust_loss
 
 
 class LensPrior(eqx.Module):
@@ -24,19 +27,21 @@ class RigProblem(eqx.Module):
     """Corners of all cameras, and IMU samples where there are any, on one trajectory of the rig.
 
     Without `imu` the chain holds one pose per view (band width zero); with it, spline control points and biases.
-    `free_chain` (B,) and `free` (P,) say which coordinates are estimated; the others are held. `huber_width` is in
-    sigmas of a corner; infinity for plain least squares.
+    `free_chain` (B,) and `free` (P,) say which coordinates are estimated; the others are held. `loss_width` is the
+    scale of the robust loss in sigmas of a corner; infinity for plain least squares.
     """
 
     templates: tuple[CameraModel, ...]
     corners: tuple[VisionData, ...]
+    geometry: TargetGeometry
     imu: InertialData | None
     prior: LensPrior
     free_chain: Bool[Array, "K B"]
     free: Bool[Array, " P"]
-    huber_width: Float[Array, ""]
+    loss_width: Float[Array, ""]
     layout: SharedLayout = eqx.field(static=True)
     order: int = eqx.field(static=True)
+    loss: str = eqx.field(static=True, default="huber")
 
     # --- the engine's protocol ---------------------------------------------------------------------------------------
 
@@ -46,6 +51,7 @@ class RigProblem(eqx.Module):
         if self.imu is not None:
             equations = _add_imu(equations, state, self.imu, self.order, self.layout)
         equations = self._add_lens_prior(equations, state)
+        equations = self._add_target_prior(equations, state)
         return equations.hold(self.free_chain, self.free)
 
     def retract(self, state: RigState, chain: Float[Array, "K B"], shared: Float[Array, " P"]) -> RigState:
@@ -55,10 +61,10 @@ class RigProblem(eqx.Module):
     def residuals(self, state: RigState) -> Float[Array, " R"]:
         """All whitened residuals (without the robust loss), as one vector."""
         parts = []
-        for group, data in enumerate(self.corners):
-            errors = vision.frame_residuals(self.templates[group], state, data, self.poses(state, data), group)
+        for group, (data, errors) in enumerate(zip(self.corners, self.corner_errors(state), strict=True)):
             parts.append(jnp.ravel(errors * jnp.sqrt(data.weight)[..., None]))
             parts.append(jnp.ravel(self._whitened_lens_error(state, group)))
+        parts.append(jnp.ravel(state.target.offsets / self.geometry.offset_sigma))
         if self.imu is not None:
             parts.append(jnp.ravel(inertial.imu_residuals(state, self.imu, self.order)))
             parts.append(inertial.prior_residuals(state, self.imu))
@@ -72,44 +78,77 @@ class RigProblem(eqx.Module):
             return vision.view_poses(state, data)
         return vision.spline_poses(state, data, self.imu.start, self.imu.dt, self.order)
 
+    def points(self, state: RigState) -> Float[Array, "3 N"]:
+        """The target's points, m."""
+        return target_points(self.geometry, state.target).T
+
     def corner_errors(self, state: RigState) -> tuple[Float[Array, "_ N 2"], ...]:
         """Projection minus measurement of every corner, px, per group."""
+        points = self.points(state)
         return tuple(
-            vision.frame_residuals(self.templates[g], state, data, self.poses(state, data), g)
+            vision.frame_residuals(self.templates[g], state, data, self.poses(state, data), g, points)
             for g, data in enumerate(self.corners)
         )
 
     def _vision(self, state: RigState) -> BlockArrow:
+        points, by_target = self.points(state), points_by_target(self.geometry, state.target, self.layout)
         intervals = state.positions.shape[0] - self.order + 1
-        size = self.free_chain.shape[1]
+        targets = self.layout.target_size
         window = jnp.zeros((intervals, self.order, 6, self.order, 6))
         gradient_window = jnp.zeros((intervals, self.order, 6))
+        border_target = jnp.zeros((intervals, self.order, 6, targets))
+        shared = jnp.zeros((self.layout.size, self.layout.size))
+        gradient = jnp.zeros(self.layout.size)
         borders: dict[int, Array] = {}
-        corners: dict[int, Array] = {}
-        gradients: dict[int, Array] = {}
         cost = jnp.zeros(())
         for group, data in enumerate(self.corners):
             poses = self.poses(state, data)
-            frames = vision.linearise_frames(self.templates[group], state, data, poses, group, self.huber_width)
+            loss = functools.partial(robust_loss, self.loss, width=self.loss_width)
+            frames = vision.linearise_frames(self.templates[group], state, data, poses, group, points, by_target, loss)
             window = window.at[poses.start].add(frames.window)
             gradient_window = gradient_window.at[poses.start].add(frames.gradient_window)
-            cost = cost + jnp.sum(frames.cost)
-            members = self.layout.groups[group]
-            by_camera = _sum_by_camera(frames, data, poses, intervals, len(members))
+            cost = cost + frames.cost
+            members, lens = self.layout.groups[group], state.lenses[group].shape[1]
+            own = frames.cross[..., : 7 + lens]
+            border = jnp.zeros((len(members), intervals, *own.shape[1:])).at[data.camera, poses.start].add(own)
+            if targets:
+                border_target = border_target.at[poses.start].add(frames.cross[..., 7 + lens :])
             for place, camera in enumerate(members):
-                borders[camera], corners[camera], gradients[camera] = (part[place] for part in by_camera)
+                borders[camera] = jnp.concatenate([border[place, ..., 7:], border[place, ..., :7]], axis=-1)
+                columns = self._columns(camera)
+                shared = shared.at[columns[:, None], columns].add(frames.shared[place])
+                gradient = gradient.at[columns].add(frames.gradient_shared[place])
 
-        cameras = range(self.layout.num_cameras)
-        padding = [(0, 0), (0, 0), (0, size - 6)]
-        border = jnp.concatenate([borders[c] for c in cameras], axis=-1)
+        gravity = jnp.zeros((intervals, self.order, 6, 2))
+        columns = [*(borders[c] for c in range(self.layout.num_cameras)), gravity, border_target]
+        padding = [(0, 0), (0, 0), (0, self.free_chain.shape[1] - 6)]
         return BlockArrow(
-            band=band_from_windows(jnp.pad(window, [*padding, (0, 0), (0, size - 6)])),
-            border=jnp.pad(chain_from_windows(jnp.pad(border, [*padding, (0, 0)])), [(0, 0), (0, 0), (0, 2)]),
-            corner=jax.scipy.linalg.block_diag(*[corners[c] for c in cameras], jnp.zeros((2, 2))),
+            band=band_from_windows(jnp.pad(window, [*padding, (0, 0), padding[-1]])),
+            border=chain_from_windows(jnp.pad(jnp.concatenate(columns, axis=-1), [*padding, (0, 0)])),
+            corner=shared,
             gradient_chain=chain_from_windows(jnp.pad(gradient_window, padding)),
-            gradient_shared=jnp.concatenate([*[gradients[c] for c in cameras], jnp.zeros(2)]),
+            gradient_shared=gradient,
             cost=cost,
         )
+
+    def _columns(self, camera: int) -> np.ndarray:
+        """Where the shared coordinates of a frame's equations stand: extrinsics, shift, lens, target."""
+        layout = self.layout
+        ranges = (layout.pose(camera), slice(layout.shift(camera), layout.shift(camera) + 1), layout.lens(camera))
+        return np.concatenate([np.arange(s.start, s.stop) for s in (*ranges, layout.target)])
+
+    def _add_target_prior(self, equations: BlockArrow, state: RigState) -> BlockArrow:
+        """Points are likely near where they are stated to be."""
+        if not self.layout.offsets:
+            return equations
+        stop = self.layout.size
+        rows = slice(stop - 3 * self.layout.offsets, stop)
+        information = 1.0 / self.geometry.offset_sigma**2
+        offsets = state.target.offsets.ravel()
+        corner = equations.corner.at[rows, rows].add(information * jnp.eye(3 * self.layout.offsets))
+        gradient = equations.gradient_shared.at[rows].add(information * offsets)
+        cost = equations.cost + 0.5 * information * jnp.sum(offsets**2)
+        return eqx.tree_at(lambda e: (e.corner, e.gradient_shared, e.cost), equations, (corner, gradient, cost))
 
     def _whitened_lens_error(self, state: RigState, group: int) -> Array:
         error = state.lenses[group] - self.prior.mean[group]
@@ -130,17 +169,6 @@ class RigProblem(eqx.Module):
                 corner = corner.at[rows, rows].add(self.prior.information[group][place])
                 gradient = gradient.at[rows].add(force[place])
         return eqx.tree_at(lambda e: (e.corner, e.gradient_shared, e.cost), equations, (corner, gradient, cost))
-
-
-def _sum_by_camera(
-    frames: FrameEquations, data: VisionData, poses: FramePoses, intervals: int, cameras: int
-) -> tuple[Array, Array, Array]:
-    """Border (C, I, k, 6, q), corner (C, q, q) and gradient (C, q) of each camera of a group."""
-    order, q = frames.cross.shape[1], frames.cross.shape[-1]
-    border = jnp.zeros((cameras, intervals, order, 6, q)).at[data.camera, poses.start].add(frames.cross)
-    corner = jnp.zeros((cameras, q, q)).at[data.camera].add(frames.shared)
-    gradient = jnp.zeros((cameras, q)).at[data.camera].add(frames.gradient_shared)
-    return border, corner, gradient
 
 
 def _add_imu(

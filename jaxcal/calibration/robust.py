@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.calibration import outliers
-from jaxcal.calibration.assemble import CameraFrames, masked_weights, split_groups, stack_groups
+from jaxcal.calibration.assemble import CameraFrames, split_groups, stack_weights
 from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.redundancy import Redundancy, measure_redundancy
 from jaxcal.calibration.state import RigState
@@ -117,14 +117,11 @@ def _with_weights(
     kept: Sequence[np.ndarray],
     sigmas: Sequence[float],
     redundancy: Sequence[Redundancy],
-    huber_width: float,
+    loss_width: float,
 ) -> RigProblem:
-    weights = masked_weights(
-        cameras, [k * r.weights[:, None] / sigma**2 for k, sigma, r in zip(kept, sigmas, redundancy, strict=True)]
-    )
-    stacked = stack_groups(problem.layout, weights)
+    weights = [k * r.weights[:, None] / sigma**2 for k, sigma, r in zip(kept, sigmas, redundancy, strict=True)]
     return eqx.tree_at(
-        lambda p: [*[data.weight for data in p.corners], p.huber_width],
+        lambda p: [*[data.weight for data in p.corners], p.loss_width],
         problem,
-        [*stacked, jnp.asarray(float(huber_width))],
+        [*stack_weights(problem.layout, cameras, weights), jnp.asarray(float(loss_width))],
     )

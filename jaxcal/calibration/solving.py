@@ -7,7 +7,15 @@ import numpy as np
 
 from jaxcal.calibration.assemble import CameraFrames, round_up, vision_data
 from jaxcal.calibration.problem import LensPrior, RigProblem
-from jaxcal.calibration.state import RigState, SharedLayout, camera_model_of, layout_of
+from jaxcal.calibration.state import (
+    RigState,
+    SharedLayout,
+    TargetState,
+    camera_model_of,
+    flat_target,
+    layout_of,
+)
+from jaxcal.calibration.target_shape import geometry_of
 from jaxcal.cameras import CameraModel
 from jaxcal.estimation import SolveResult, solve
 from jaxcal.targets import Target
@@ -43,10 +51,13 @@ def camera_problem(
     weights: Sequence[np.ndarray],
     T_cam_rig: tuple[np.ndarray, np.ndarray],
     T_target_rig: tuple[np.ndarray, np.ndarray],
-    huber_width: float,
+    loss_width: float,
+    layout: SharedLayout | None = None,
+    target_state: TargetState | None = None,
+    loss: str = "huber",
 ) -> tuple[RigProblem, RigState]:
     """Problem and start of a camera-only calibration; cam0's pose in the rig, time shifts and gravity are held."""
-    layout = layout_of(list(models))
+    layout = layout or layout_of(list(models))
     free = np.ones(layout.size, dtype=bool)
     free[layout.pose(0)] = False
     free[layout.gravity] = False
@@ -61,14 +72,16 @@ def camera_problem(
     positions = np.concatenate([T_target_rig[1], np.zeros((padding, 3))])
     problem = RigProblem(
         templates=templates_of(models, layout),
-        corners=vision_data(layout, cameras, target, weights=weights, views=views),
+        corners=vision_data(layout, cameras, weights=weights, views=views),
+        geometry=geometry_of(target),
         imu=None,
         prior=no_prior(layout),
         free_chain=jnp.asarray(free_chain),
         free=jnp.asarray(free),
-        huber_width=jnp.asarray(float(huber_width)),
+        loss_width=jnp.asarray(float(loss_width)),
         layout=layout,
         order=1,
+        loss=loss,
     )
     state = RigState(
         lenses=stack_lenses(models, layout),
@@ -79,6 +92,7 @@ def camera_problem(
         rotations=jnp.asarray(rotations),
         positions=jnp.asarray(positions),
         biases=jnp.zeros((len(positions), 0)),
+        target=flat_target(layout) if target_state is None else target_state,
     )
     return problem, state
 
@@ -103,7 +117,7 @@ def refine_single(
         weights=[np.ones(frames.seen.shape)],
         T_cam_rig=(np.eye(3)[None], np.zeros((1, 3))),
         T_target_rig=(R_target_cam, -np.einsum("fij,fj->fi", R_target_cam, t_cam_target)),
-        huber_width=huber_width,
+        loss_width=huber_width,
     )
     result: SolveResult = solve(problem, state, max_steps=max_steps)
     refined = camera_model_of(result.state, problem.layout, problem.templates, 0)

@@ -1,4 +1,4 @@
-"""The unknowns of a rig: cameras, extrinsics, time offsets, gravity, and the chain of poses and biases."""
+"""The unknowns of a rig: cameras, extrinsics, time offsets, gravity, the target, and the chain of poses and biases."""
 
 from dataclasses import dataclass
 
@@ -18,11 +18,16 @@ class SharedLayout:
 
     Cameras are gathered in groups of equal model, so that one compiled projection serves a group; `groups[g]` lists
     its cameras, `sizes[c]` the number of lens parameters of camera c. The vector holds, camera by camera, the lens
-    parameters, T_cam_rig (rotation, translation), the time shift; and at last the direction of gravity (2).
+    parameters, T_cam_rig (rotation, translation), the time shift; then the direction of gravity (2); then the target:
+    T_target_board of every board but the first (6 each), the warp (2 where it is estimated), and the offsets of the
+    points (3 each, where they are).
     """
 
     groups: tuple[tuple[int, ...], ...]
     sizes: tuple[int, ...]
+    extra_boards: int = 0
+    warp: bool = False
+    offsets: int = 0
 
     @property
     def num_cameras(self) -> int:
@@ -30,7 +35,11 @@ class SharedLayout:
 
     @property
     def size(self) -> int:
-        return sum(self.sizes) + 7 * self.num_cameras + 2
+        return sum(self.sizes) + 7 * self.num_cameras + 2 + self.target_size
+
+    @property
+    def target_size(self) -> int:
+        return 6 * self.extra_boards + 2 * self.warp + 3 * self.offsets
 
     def start(self, camera: int) -> int:
         return sum(self.sizes[:camera]) + 7 * camera
@@ -51,7 +60,12 @@ class SharedLayout:
 
     @property
     def gravity(self) -> slice:
-        return slice(self.size - 2, self.size)
+        stop = self.size - self.target_size
+        return slice(stop - 2, stop)
+
+    @property
+    def target(self) -> slice:
+        return slice(self.size - self.target_size, self.size)
 
     def place(self, camera: int) -> tuple[int, int]:
         """(group, place in the group) of a camera."""
@@ -61,11 +75,49 @@ class SharedLayout:
         raise IndexError(camera)
 
 
-def layout_of(models: list[CameraModel]) -> SharedLayout:
-    """Group cameras by their model class."""
+def layout_of(
+    models: list[CameraModel], *, extra_boards: int = 0, warp: bool = False, offsets: int = 0
+) -> SharedLayout:
+    """Group cameras by their model class; `offsets` is the number of points that may move, or 0."""
     classes = list(dict.fromkeys(type(model) for model in models))
     groups = tuple(tuple(c for c, model in enumerate(models) if type(model) is cls) for cls in classes)
-    return SharedLayout(groups, tuple(model.num_parameters for model in models))
+    return SharedLayout(groups, tuple(model.num_parameters for model in models), extra_boards, warp, offsets)
+
+
+class TargetState(eqx.Module):
+    """What is not known of the target: places of its boards, and its true shape.
+
+    `R_target_board` (E, 3, 3), `t_target_board` (E, 3) of every board but the first, whose frame is the target's;
+    `warp` (2,) m, the bend along columns and rows (`TargetGeometry`), empty where the board is taken for flat;
+    `offsets` (N, 3) m of the points from their stated places, empty where those are taken as stated.
+    """
+
+    R_target_board: Float[Array, "E 3 3"]
+    t_target_board: Float[Array, "E 3"]
+    warp: Float[Array, " w"]
+    offsets: Float[Array, "M 3"]
+
+    def retract(self, layout: SharedLayout, step: Float[Array, " T"]) -> "TargetState":
+        """Move along a tangent step; boards turn on the left."""
+        boards = step[: 6 * layout.extra_boards].reshape(-1, 6)
+        bend = step[6 * layout.extra_boards :][: len(self.warp)]
+        moved = step[6 * layout.extra_boards + len(self.warp) :].reshape(-1, 3)
+        return TargetState(
+            R_target_board=jax.vmap(so3.exp)(boards[:, :3]) @ self.R_target_board,
+            t_target_board=self.t_target_board + boards[:, 3:],
+            warp=self.warp + bend,
+            offsets=self.offsets + moved,
+        )
+
+
+def flat_target(layout: SharedLayout) -> TargetState:
+    """A target as it was stated: flat, its boards in one place."""
+    return TargetState(
+        R_target_board=jnp.tile(jnp.eye(3), (layout.extra_boards, 1, 1)),
+        t_target_board=jnp.zeros((layout.extra_boards, 3)),
+        warp=jnp.zeros(2 * layout.warp),
+        offsets=jnp.zeros((layout.offsets, 3)),
+    )
 
 
 class RigState(eqx.Module):
@@ -74,7 +126,7 @@ class RigState(eqx.Module):
     `lenses[g]` (C_g, n_g) lens parameters of the cameras of group g; `R_cam_rig` (C, 3, 3), `t_cam_rig` (C, 3);
     `shift` (C,) s, rig time = camera time + shift; `gravity` (3,) m/s^2 in the target frame; chain: `rotations`
     (K, 3, 3) and `positions` (K, 3) of T_target_rig (poses of views, or control points), `biases` (K, 6) gyro then
-    accel (K, 0 without IMU).
+    accel (K, 0 without IMU); `target` what is not known of the target.
     """
 
     lenses: tuple[Float[Array, "_ _"], ...]
@@ -85,6 +137,7 @@ class RigState(eqx.Module):
     rotations: Float[Array, "K 3 3"]
     positions: Float[Array, "K 3"]
     biases: Float[Array, "K b"]
+    target: TargetState
 
     def retract(self, layout: SharedLayout, chain: Float[Array, "K B"], shared: Float[Array, " P"]) -> "RigState":
         """Move along a tangent step: rotations of the chain on the right, those of the cameras on the left."""
@@ -106,6 +159,7 @@ class RigState(eqx.Module):
             rotations=self.rotations @ exp(chain[:, :3]),
             positions=self.positions + chain[:, 3:6],
             biases=self.biases + chain[:, 6:],
+            target=self.target.retract(layout, shared[layout.target]) if layout.target_size else self.target,
         )
 
 

@@ -1,5 +1,7 @@
 """Corners of the target: reprojection residuals, reduced frame by frame before the chain sees them."""
 
+import functools
+from collections.abc import Callable
 from typing import Protocol
 
 import equinox as eqx
@@ -9,7 +11,6 @@ from jaxtyping import Array, Float, Int
 
 from jaxcal.calibration.state import RigState
 from jaxcal.cameras import CameraModel
-from jaxcal.estimation import huber
 from jaxcal.trajectory import PoseSpline, basis_matrix, increments, rotation_at, so3, weights
 
 # Frames are reduced in batches of this many: large enough to vectorise, small enough to stay in the cache.
@@ -20,17 +21,16 @@ class VisionData(eqx.Module):
     """Detections of a group of cameras of equal model, padded to all points of the target.
 
     `camera` (F,) place in the group; `rig_camera` (F,) index in the rig; `view` (F,) index into the chain of poses
-    (discrete problems); `time` (F,) s on the camera's clock (continuous ones); `pixels` (F, N, 2); `weight` (F, N) 1 /
-    sigma^2 in px^-2, 0 where the corner is absent; `points` (N, 3) in the target frame, m.
+    (discrete problems); `time` (F,) s on the camera's clock (continuous ones); `pixels` (F, 2, N); `weight` (F, N) 1 /
+    sigma^2 in px^-2, 0 where the corner is absent. Every FRAME_BATCH frames on end are of one camera.
     """
 
     camera: Int[Array, " F"]
     rig_camera: Int[Array, " F"]
     view: Int[Array, " F"]
     time: Float[Array, " F"]
-    pixels: Float[Array, "F N 2"]
+    pixels: Float[Array, "F 2 N"]
     weight: Float[Array, "F N"]
-    points: Float[Array, "N 3"]
 
 
 class FramePoses(eqx.Module):
@@ -89,14 +89,15 @@ def spline_poses(state: RigState, data: VisionData, start: Array, dt: Array, ord
 
 
 class FrameEquations(eqx.Module):
-    """Gauss-Newton contributions of frames, before they are added up: window (k x 6), and shared (q = n + 7) parts."""
+    """Gauss-Newton contributions of frames to a window of k chain blocks (6 coordinates each) and to q = n + 7 + T
+    shared coordinates (lens, extrinsics, time shift; target); and what the frames of each camera add up to."""
 
-    window: Float[Array, "*F k 6 k 6"]
-    cross: Float[Array, "*F k 6 q"]
-    shared: Float[Array, "*F q q"]
-    gradient_window: Float[Array, "*F k 6"]
-    gradient_shared: Float[Array, "*F q"]
-    cost: Float[Array, "*F"]
+    window: Float[Array, "F k 6 k 6"]
+    cross: Float[Array, "F k 6 q"]
+    gradient_window: Float[Array, "F k 6"]
+    shared: Float[Array, "C q q"]
+    gradient_shared: Float[Array, "C q"]
+    cost: Float[Array, ""]
 
 
 def project_frame(
@@ -104,18 +105,21 @@ def project_frame(
     lens: Float[Array, " n"],
     R_cam_target: Float[Array, "3 3"],
     t_cam_target: Float[Array, "3"],
-    points: Float[Array, "N 3"],
-) -> Float[Array, "N 2"]:
-    """Pixels (N, 2) of target points in one frame."""
+    points: Float[Array, "3 N"],
+) -> Float[Array, "2 N"]:
+    """Pixels of target points in one frame."""
     model = template.with_parameters(lens)
-    return jax.vmap(lambda point: model.project(R_cam_target @ point + t_cam_target))(points)
+    return jax.vmap(model.project, in_axes=1, out_axes=1)(R_cam_target @ points + t_cam_target[:, None])
 
 
-def frame_residuals(template: CameraModel, state: RigState, data: VisionData, poses: FramePoses, group: int) -> Array:
-    """Projection minus measurement (F, N, 2), px."""
+def frame_residuals(
+    template: CameraModel, state: RigState, data: VisionData, poses: FramePoses, group: int, points: Float[Array, "3 N"]
+) -> Float[Array, "F N 2"]:
+    """Projection minus measurement, px."""
     rotation, translation = _camera_poses(state, data, poses)
     project = jax.vmap(project_frame, in_axes=(None, 0, 0, 0, None))
-    return project(template, state.lenses[group][data.camera], rotation, translation, data.points) - data.pixels
+    projected = project(template, state.lenses[group][data.camera], rotation, translation, points)
+    return (projected - data.pixels).swapaxes(1, 2)
 
 
 def _camera_poses(state: RigState, data: VisionData, poses: FramePoses) -> tuple[Array, Array]:
@@ -126,64 +130,93 @@ def _camera_poses(state: RigState, data: VisionData, poses: FramePoses) -> tuple
 
 
 def linearise_frames(
-    template: CameraModel, state: RigState, data: VisionData, poses: FramePoses, group: int, huber_width: Array
+    template: CameraModel,
+    state: RigState,
+    data: VisionData,
+    poses: FramePoses,
+    group: int,
+    points: Float[Array, "3 N"],
+    by_target: Float[Array, "T 3 N"],
+    loss: Callable[[Array], tuple[Array, Array]],
 ) -> FrameEquations:
-    """Equations of all frames of one group, in batches."""
+    """Equations of all frames of one group, batch by batch; all frames of a batch are of one camera.
+
+    `points` are the target's, `by_target` their derivative by the target's T unknowns; `loss` gives (rho, weight) of
+    squared whitened residuals.
+    """
     rotation, translation = _camera_poses(state, data, poses)
-    lens = state.lenses[group][data.camera]
-    R_cam_rig = state.R_cam_rig[data.rig_camera]
-
-    def one(frame: tuple) -> FrameEquations:
-        pose, lens, R_cam_target, t_cam_target, R_cam_rig, pixels, weight = frame
-        gram, cost = _reduce_corners(
-            template, lens, R_cam_target, t_cam_target, data.points, pixels, weight, huber_width
-        )
-        return _lift(gram, cost, pose, R_cam_target, R_cam_rig)
-
-    frames = (poses, lens, rotation, translation, R_cam_rig, data.pixels, data.weight)
+    cameras, q = state.lenses[group].shape[0], state.lenses[group].shape[1] + 7 + by_target.shape[0]
+    frames = (poses, rotation, translation, data.pixels, data.weight)
     batches = jax.tree.map(lambda leaf: leaf.reshape(-1, FRAME_BATCH, *leaf.shape[1:]), frames)
-    reduced = jax.lax.map(jax.vmap(one), batches)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), reduced)
+    camera = data.camera[::FRAME_BATCH]
+    R_cam_rig = state.R_cam_rig[data.rig_camera[::FRAME_BATCH]]
+
+    def batch(total: tuple[Array, Array, Array], parts: tuple) -> tuple[tuple[Array, Array, Array], tuple]:
+        camera, R_cam_rig, (poses, rotation, translation, pixels, weight) = parts
+        reduce = functools.partial(_reduce_corners, template, state.lenses[group][camera], points, by_target, loss)
+        gram, cost = jax.vmap(reduce)(rotation, translation, pixels, weight)
+        chain, turned = jax.vmap(_lift, in_axes=(0, 0, 0, None))(gram, poses, rotation, R_cam_rig)
+        shared, gradient = _shared_equations(gram.sum(axis=0), turned.sum(axis=0), state.lenses[group].shape[1])
+        total = (total[0].at[camera].add(shared), total[1].at[camera].add(gradient), total[2] + jnp.sum(cost))
+        return total, chain
+
+    start = (jnp.zeros((cameras, q, q)), jnp.zeros((cameras, q)), jnp.zeros(()))
+    (shared, gradient_shared, cost), chain = jax.lax.scan(batch, start, (camera, R_cam_rig, batches))
+    window, cross, gradient_window = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in chain)
+    return FrameEquations(window, cross, gradient_window, shared, gradient_shared, cost)
 
 
 def _reduce_corners(
     template: CameraModel,
     lens: Float[Array, " n"],
+    points: Float[Array, "3 N"],
+    by_target: Float[Array, "T 3 N"],
+    loss: Callable[[Array], tuple[Array, Array]],
     R_cam_target: Float[Array, "3 3"],
     t_cam_target: Float[Array, "3"],
-    points: Float[Array, "N 3"],
-    pixels: Float[Array, "N 2"],
+    pixels: Float[Array, "2 N"],
     weight: Float[Array, " N"],
-    huber_width: Array,
 ) -> tuple[Float[Array, "m m"], Float[Array, ""]]:
-    """Gram matrix of (rotation, translation, lens, residual) over a frame's corners; pose perturbed on the left."""
+    """Gram matrix of (rotation, translation, lens, target, residual) over a frame; the pose is perturbed on the left.
 
-    def corner(point: Array, pixel: Array) -> Array:
-        rotated = R_cam_target @ point
+    Corners run along the last axis, which is the one that the compiler vectorises.
+    """
+    rotated = R_cam_target @ points
 
+    def corner(camera_point: Array) -> tuple[Array, tuple[Array, Array], tuple[Array, Array]]:
         def project(camera_point: Array, lens: Array) -> Array:
             return template.with_parameters(lens).project(camera_point)
 
-        camera_point = rotated + t_cam_target
-        by_point, by_lens = jax.jacrev(project, argnums=(0, 1))(camera_point, lens)
-        residual = project(camera_point, lens) - pixel
-        by_rotation = -by_point @ so3.hat(rotated)
-        return jnp.concatenate([by_rotation, by_point, by_lens, residual[:, None]], axis=1)
+        # Pulled back coordinate by coordinate: twice as fast as `jacrev`, which carries a batch of unit vectors along.
+        pixel, pull = jax.vjp(project, camera_point, lens)
+        return pixel, pull(jnp.array([1.0, 0.0])), pull(jnp.array([0.0, 1.0]))
 
-    rows = jax.vmap(corner)(points, pixels)  # (N, 2, 6 + n + 1)
-    squared = weight * jnp.sum(rows[:, :, -1] ** 2, axis=1)
-    rho, robust_weight = huber(squared, huber_width)
+    projected, *pulled = jax.vmap(corner, in_axes=1, out_axes=-1)(rotated + t_cam_target[:, None])
+    residual = projected - pixels
+    rho, robust_weight = loss(weight * jnp.sum(residual**2, axis=0))
     seen = weight > 0
-    total = jnp.where(seen, weight * robust_weight, 0.0)
-    rows = jnp.where(seen[:, None, None], rows, 0.0)
-    flat = rows.reshape(-1, rows.shape[-1])
-    return (flat * jnp.repeat(total, 2)[:, None]).T @ flat, 0.5 * jnp.sum(jnp.where(seen, rho, 0.0))
+    root = jnp.sqrt(jnp.where(seen, weight * robust_weight, 0.0))
+    x, y, z = rotated
+    gram = jnp.zeros((), dtype=residual.dtype)
+    for (by_point, by_lens), error in zip(pulled, residual, strict=True):
+        a, b, c = by_point
+        by_rotation = jnp.stack([y * c - z * b, z * a - x * c, x * b - y * a])  # -by_point hat(rotated)
+        by_shape = jnp.einsum("jn,tjn->tn", R_cam_target.T @ by_point, by_target)
+        rows = jnp.concatenate([by_rotation, by_point, by_lens, by_shape, error[None]])
+        # Not a product with zero: what is not seen may be anything, infinite even.
+        rows = jnp.where(seen, rows * root, 0.0)
+        gram = gram + rows @ rows.T
+    return gram, 0.5 * jnp.sum(jnp.where(seen, rho, 0.0))
 
 
 def _lift(
-    gram: Float[Array, "m m"], cost: Array, pose: FramePoses, R_cam_target: Array, R_cam_rig: Array
-) -> FrameEquations:
-    """From (camera pose, lens) to (window of the chain, lens, extrinsics, time shift) by the chain rule."""
+    gram: Float[Array, "m m"], pose: FramePoses, R_cam_target: Array, R_cam_rig: Array
+) -> tuple[tuple[Array, Array, Array], Float[Array, "7 m+1"]]:
+    """From the camera's pose to the window of the chain, the extrinsics and the time shift, by the chain rule.
+
+    Returns the window's Hessian (k, 6, k, 6), its products with (lens, extrinsics, shift, target) (k, 6, q), its
+    gradient (k, 6); and the rows of extrinsics and shift times (extrinsics, shift; lens, target, residual).
+    """
     order = pose.basis.shape[0]
     lever = so3.hat(R_cam_target @ pose.position)
     identity = jnp.eye(3)
@@ -205,15 +238,17 @@ def _lift(
     by_extrinsics = jnp.block([[identity, jnp.zeros((3, 3))], [lever, identity]])
     by_rig = jnp.concatenate([by_extrinsics, by_shift], axis=1)  # (6, 7)
 
-    pose_pose, pose_lens, pose_residual = gram[:6, :6], gram[:6, 6:-1], gram[:6, -1]
-    lens_lens, lens_residual = gram[6:-1, 6:-1], gram[6:-1, -1]
-    weighted = by_window.T @ pose_pose
-    lens_rig = pose_lens.T @ by_rig
-    return FrameEquations(
-        window=(weighted @ by_window).reshape(order, 6, order, 6),
-        cross=jnp.concatenate([by_window.T @ pose_lens, weighted @ by_rig], axis=1).reshape(order, 6, -1),
-        shared=jnp.block([[lens_lens, lens_rig], [lens_rig.T, by_rig.T @ pose_pose @ by_rig]]),
-        gradient_window=(by_window.T @ pose_residual).reshape(order, 6),
-        gradient_shared=jnp.concatenate([lens_residual, by_rig.T @ pose_residual]),
-        cost=cost,
-    )
+    products = jnp.concatenate([gram[:6, :6] @ by_rig, gram[:6, 6:]], axis=1)  # (6, 7 + n + T + 1)
+    cross = by_window.T @ products
+    window = (by_window.T @ gram[:6, :6] @ by_window).reshape(order, 6, order, 6)
+    return (window, cross[:, :-1].reshape(order, 6, -1), cross[:, -1].reshape(order, 6)), by_rig.T @ products
+
+
+def _shared_equations(
+    gram: Float[Array, "m m"], turned: Float[Array, "7 m+1"], lens: int
+) -> tuple[Float[Array, "q q"], Float[Array, " q"]]:
+    """Hessian and gradient of (extrinsics, shift, lens, target) from the sums over frames."""
+    rest = gram[6:, 6:]
+    upper = turned[:, :-1]
+    hessian = jnp.block([[upper], [upper[:, 7:].T, rest[:-1, :-1]]])
+    return hessian, jnp.concatenate([turned[:, -1], rest[:-1, -1]])

@@ -9,12 +9,13 @@ from jaxcal.estimation.block_arrow import (
     factorise,
 )
 from jaxcal.estimation.descent import BlockArrowDescent, BlockStep, damped_step
-from jaxcal.estimation.losses import huber
+from jaxcal.estimation.losses import LOSSES, Loss, barron, huber, robust_loss
 from jaxcal.estimation.problem import BlockArrowProblem, State
 from jaxcal.estimation.solver import BlockArrowLevenbergMarquardt, SolveResult, solve
 from jaxcal.estimation.threads import single_threaded_blas
 
 __all__ = [
+    "LOSSES",
     "BlockArrow",
     "BlockArrowDescent",
     "BlockArrowFactor",
@@ -22,13 +23,16 @@ __all__ = [
     "BlockArrowProblem",
     "BlockStep",
     "GaussNewtonAdjoint",
+    "Loss",
     "SolveResult",
     "State",
     "band_from_windows",
+    "barron",
     "chain_from_windows",
     "damped_step",
     "factorise",
     "huber",
+    "robust_loss",
     "single_threaded_blas",
     "solve",
 ]

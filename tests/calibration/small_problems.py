@@ -1,5 +1,6 @@
 """Small calibration problems in random states near consistency, for comparison with dense linear algebra."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -12,7 +13,8 @@ from jaxcal.calibration import solving
 from jaxcal.calibration.assemble import CameraFrames, camera_frames, vision_data
 from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.spline_setup import bin_imu, make_grid
-from jaxcal.calibration.state import RigState, layout_of
+from jaxcal.calibration.state import RigState, TargetState, flat_target, layout_of
+from jaxcal.calibration.target_shape import geometry_of
 from jaxcal.cameras import CameraModel, PinholeEquidistant, PinholeRadtan
 
 BOARD = Checkerboard(rows=3, cols=4, spacing=0.1)
@@ -80,9 +82,28 @@ def camera_only(seed: int) -> tuple[RigProblem, RigState]:
         weights=random_weights(rng, cameras),
         T_cam_rig=extrinsics(rng),
         T_target_rig=facing_board(rng, 5),
-        huber_width=np.inf,
+        loss_width=np.inf,
     )
     return random_prior(rng, problem, state), state
+
+
+def with_unknown_target(seed: int) -> tuple[RigProblem, RigState]:
+    """As `camera_only`, the target being two boards at an unknown mutual pose, bent, with every point off its place."""
+    rng = np.random.default_rng(seed)
+    problem, state = camera_only(seed)
+    count = len(BOARD.points)
+    layout = layout_of(list(LENSES), extra_boards=1, warp=True, offsets=count)
+    free = np.concatenate([np.asarray(problem.free), np.ones(layout.target_size, dtype=bool)])
+    target = TargetState(
+        R_target_board=jnp.asarray(near(rng, np.eye(3), 0.2)[None]),
+        t_target_board=jnp.asarray(0.1 * rng.standard_normal((1, 3))),
+        warp=jnp.asarray(0.02 * rng.standard_normal(2)),
+        offsets=jnp.asarray(0.002 * rng.standard_normal((count, 3))),
+    )
+    geometry = eqx.tree_at(lambda g: g.board, geometry_of(BOARD), jnp.arange(count) % 2)
+    problem = eqx.tree_at(lambda p: (p.geometry, p.free), problem, (geometry, jnp.asarray(free)))
+    problem = dataclasses.replace(problem, layout=layout)
+    return problem, dataclasses.replace(state, target=target)
 
 
 def with_imu(seed: int, order: int) -> tuple[RigProblem, RigState]:
@@ -101,15 +122,15 @@ def with_imu(seed: int, order: int) -> tuple[RigProblem, RigState]:
         corners=vision_data(
             layout,
             cameras,
-            BOARD,
             weights=random_weights(rng, cameras),
             times=[np.sort(rng.uniform(0.05, 0.95, len(frames.frames))) for frames in cameras],
         ),
+        geometry=geometry_of(BOARD),
         imu=data,
         prior=solving.no_prior(layout),
         free_chain=jnp.ones((count, 12), dtype=bool),
         free=jnp.ones(layout.size, dtype=bool),
-        huber_width=jnp.asarray(jnp.inf),
+        loss_width=jnp.asarray(jnp.inf),
         layout=layout,
         order=order,
     )
@@ -124,5 +145,6 @@ def with_imu(seed: int, order: int) -> tuple[RigProblem, RigState]:
         rotations=jnp.asarray(np.diag([1.0, -1.0, -1.0]) @ turns),
         positions=jnp.asarray(np.array([0.15, 0.1, 1.0]) + 0.05 * rng.standard_normal((count, 3))),
         biases=jnp.asarray(0.1 * rng.standard_normal((count, 6))),
+        target=flat_target(layout),
     )
     return random_prior(rng, problem, state), state

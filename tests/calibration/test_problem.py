@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import Array
-from small_problems import camera_only, with_imu
+from small_problems import camera_only, with_imu, with_unknown_target
 
 from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.state import RigState, tangent_basis
@@ -78,6 +78,12 @@ def test_equations_of_cameras_alone_are_those_of_autodiff(seed: int) -> None:
     assert_equations_match(*camera_only(seed), np.random.default_rng(seed))
 
 
+@settings(deadline=None, max_examples=8)
+@given(seed=seeds)
+def test_equations_with_an_unknown_target_are_those_of_autodiff(seed: int) -> None:
+    assert_equations_match(*with_unknown_target(seed), np.random.default_rng(seed))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [4, 6])
 def test_equations_of_cameras_and_imu_are_those_of_autodiff(order: int) -> None:
@@ -106,7 +112,7 @@ def test_held_parameters_are_left_alone(seed: int) -> None:
 @given(seed=seeds, width=st.floats(0.5, 200.0))
 def test_the_gradient_is_that_of_the_cost_under_hubers_loss(seed: int, width: float) -> None:
     problem, state = camera_only(seed)
-    problem = eqx.tree_at(lambda p: p.huber_width, problem, jnp.asarray(width))
+    problem = eqx.tree_at(lambda p: p.loss_width, problem, jnp.asarray(width))
     rng = np.random.default_rng(seed)
     equations = linearise(problem, state)
     chain = rng.standard_normal(problem.free_chain.shape) * np.asarray(problem.free_chain)
