@@ -29,7 +29,10 @@ _MAX_ROUNDS = 12
 
 @dataclass(frozen=True)
 class _Tags:
-    """Tags in an image: `ids` (T,), `corners` (T, 4, 2) pixels, anticlockwise from the lower left as Kalibr's."""
+    """Tags in an image: `ids` (T,), `corners` (T, 4, 2) pixels, anticlockwise from the lower left as Kalibr's.
+
+    Ids count from 0 here, whatever the board's first one: they are places on the board.
+    """
 
     ids: np.ndarray
     corners: np.ndarray
@@ -45,7 +48,7 @@ _NO_TAGS = _Tags(np.empty(0, np.int64), np.empty((0, 4, 2)))
 def _board(target: AprilGrid) -> np.ndarray:
     """Board coordinates (T, 4, 2) of each tag's corners, metres."""
     points = target.points[:, :2]
-    return np.stack([points[target.tag_points(tag)] for tag in range(target.rows * target.cols)])
+    return np.stack([points[target.tag_points(tag)] for tag in target.ids])
 
 
 def find_aprilgrid(image: np.ndarray, target: AprilGrid) -> tuple[np.ndarray, np.ndarray]:
@@ -123,12 +126,12 @@ def _widen(quads: np.ndarray, pixels: float) -> np.ndarray:
 
 
 @functools.cache
-def _codes(num_tags: int) -> np.ndarray:
-    """Data bits (T, 36) of the first tags, upright as Kalibr prints them, row by row from the top; mean 0, norm 1."""
-    images = [cv2.aruco.generateImageMarker(_dictionary(), tag, _CELLS, None, _BORDER) for tag in range(num_tags)]
+def _codes(ids: range) -> np.ndarray:
+    """Data bits (T, 36) of tags, upright as Kalibr prints them, row by row from the top; mean 0, norm 1."""
+    images = [cv2.aruco.generateImageMarker(_dictionary(), tag, _CELLS, None, _BORDER) for tag in ids]
     data = np.stack(images)[:, _BORDER:-_BORDER, _BORDER:-_BORDER]
     upright = np.rot90(data, 2, axes=(1, 2))  # OpenCV's tags of this family stand on their heads
-    return _normalised(upright.reshape(num_tags, -1).astype(np.float64))
+    return _normalised(upright.reshape(len(ids), -1).astype(np.float64))
 
 
 def _normalised(rows: np.ndarray) -> np.ndarray:
@@ -156,7 +159,7 @@ def _read_cells(image: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return cells.astype(np.float64).mean(axis=(2, 4))
 
 
-def _agreement(cells: np.ndarray, num_tags: int) -> np.ndarray:
+def _agreement(cells: np.ndarray, ids: range) -> np.ndarray:
     """Correlation (Q, T) of the data bits with each code; -1 where the border is not dark or the contrast is low."""
     data = cells[:, _BORDER:-_BORDER, _BORDER:-_BORDER].reshape(len(cells), -1)
     border = np.ones((_CELLS, _CELLS), bool)
@@ -165,7 +168,7 @@ def _agreement(cells: np.ndarray, num_tags: int) -> np.ndarray:
     white = np.percentile(data, 85, axis=1)
     dark = np.median(rim, axis=1) + _MIN_CONTRAST < white
     mostly_dark = np.mean(rim < ((np.median(rim, axis=1) + white) / 2.0)[:, None], axis=1) > 0.8
-    scores = _normalised(data) @ _codes(num_tags).T
+    scores = _normalised(data) @ _codes(ids).T
     return np.where((dark & mostly_dark)[:, None], scores, -1.0)
 
 
@@ -179,7 +182,7 @@ def _decode(image: np.ndarray, quads: np.ndarray, target: AprilGrid) -> _Tags:
     cells = _read_cells(image, quads)
     for turn in range(4):
         # Starting one corner later is the same as turning the tag clockwise.
-        scores = _agreement(np.rot90(cells, -turn, axes=(1, 2)), target.rows * target.cols)
+        scores = _agreement(np.rot90(cells, -turn, axes=(1, 2)), target.ids)
         for quad, row in zip(np.roll(quads, -turn, axis=1), scores, strict=True):
             tag = int(np.argmax(row))
             if row[tag] >= _MIN_DECODED and row[tag] > best.get(tag, (0.0, quad))[0]:
@@ -211,7 +214,6 @@ def _refined(image: np.ndarray, tags: _Tags, target: AprilGrid) -> tuple[np.ndar
 
 def _complete(image: np.ndarray, tags: _Tags, target: AprilGrid) -> _Tags:
     """Add the tags that the image shows where the known ones predict them, growing outwards."""
-    num_tags = target.rows * target.cols
     tags = _consistent(image, tags, target)
     refused: set[int] = set()
     for _ in range(_MAX_ROUNDS):
@@ -225,7 +227,7 @@ def _complete(image: np.ndarray, tags: _Tags, target: AprilGrid) -> _Tags:
         refined, _ = _refined(image, _Tags(np.array(missing), guesses), target)
         scores = np.full(len(missing), -1.0)
         for corners in (guesses, refined):
-            agreement = _agreement(_read_cells(image, corners), num_tags)[np.arange(len(missing)), missing]
+            agreement = _agreement(_read_cells(image, corners), target.ids)[np.arange(len(missing)), missing]
             scores = np.maximum(scores, agreement)
         seen = inside & (scores >= _MIN_PREDICTED)
         # Refused tags are tried again only from nearer neighbours, that is, when something new was found.
@@ -269,7 +271,7 @@ def _checked_corners(image: np.ndarray, tags: _Tags, target: AprilGrid) -> tuple
     if not len(tags):
         return np.empty(0, np.int64), np.empty((0, 2))
     refined, stayed = _refined(image, tags, target)
-    point = np.concatenate([target.tag_points(int(tag)) for tag in tags.ids])
+    point = np.concatenate([target.tag_points(target.first_id + int(tag)) for tag in tags.ids])
     point, pixels = point[stayed.ravel()], refined[stayed]
     keep = agreeing_corners(_board(target)[tags.ids][stayed], pixels, (image.shape[1], image.shape[0]))
     return point[keep], pixels[keep]

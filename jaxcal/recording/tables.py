@@ -104,17 +104,17 @@ def _points(path: Path, table: dict[str, np.ndarray], target: Target, prefix: st
 def _tag_corner_points(path: Path, tag_corner: np.ndarray, target: Target) -> np.ndarray:
     if not isinstance(target, AprilGrid):
         raise CalibrationError(f"{path}: the table names tags, but the target is a {type(target).__name__}.")
-    num_tags = target.rows * target.cols
+    first, last = target.ids[0], target.ids[-1]
     tags, corners = np.moveaxis(tag_corner.astype(np.int64).reshape(-1, 2), 1, 0)
-    bad = (tags < 0) | (tags >= num_tags) | (corners < 0) | (corners > 3)
+    bad = (tags < first) | (tags > last) | (corners < 0) | (corners > 3)
     if bad.any():
         row = int(np.argmax(bad))
         raise CalibrationError(
-            f"{path}: row {row} names tag {tags[row]}, corner {corners[row]}; the target has tags 0 to {num_tags - 1} "
+            f"{path}: row {row} names tag {tags[row]}, corner {corners[row]}; the target has tags {first} to {last} "
             "with corners 0 to 3."
         )
-    by_tag = np.stack([target.tag_points(tag) for tag in range(num_tags)])
-    return by_tag[tags, corners]
+    by_tag = np.stack([target.tag_points(tag) for tag in target.ids])
+    return by_tag[tags - first, corners]
 
 
 def _column(path: Path, table: dict[str, np.ndarray], name: str, alternative: str | None = None) -> np.ndarray:

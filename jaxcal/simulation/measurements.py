@@ -76,7 +76,7 @@ def _whole_features(rig: SimulatedRig, seen: np.ndarray) -> np.ndarray:
     if not isinstance(rig.target, AprilGrid):
         return seen & seen.all(axis=1, keepdims=True)
     whole = np.zeros_like(seen)
-    for tag in range(rig.target.rows * rig.target.cols):
+    for tag in rig.target.ids:
         corners = rig.target.tag_points(tag)
         whole[:, corners] = seen[:, corners].all(axis=1, keepdims=True)
     return whole

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from jaxcal.cameras import CameraModel
-from jaxcal.simulation.pattern import Pattern
+from jaxcal.simulation.pattern import BLACK, Pattern
 
 # The pixel's own area blurs like a Gaussian of this variance (px^2).
 _PIXEL_VARIANCE = 1.0 / 12.0
@@ -44,21 +44,39 @@ class Lines(NamedTuple):
     first: Int32[Array, " b"]
 
 
+class Discs(NamedTuple):
+    """Equal discs on L rectangular lattices: `origin`, `pitch` and highest number `last`, each (L, 2) for x and y."""
+
+    origin: Float32[Array, "lattices 2"]
+    pitch: Float32[Array, "lattices 2"]
+    last: Float32[Array, "lattices 2"]
+    radius: Float32[Array, " lattices"]
+
+
 class Surface(NamedTuple):
-    """A pattern made ready for rendering: its lines, and the reflectance of each cell's 3 x 3 neighbourhood."""
+    """A pattern made ready for rendering: its lines, the reflectance of each cell's 3 x 3 neighbourhood, its discs."""
 
     x: Lines
     y: Lines
     neighbours: Float32[Array, "cells 9"]
+    discs: Discs
 
 
 def surface_of(pattern: Pattern) -> Surface:
     """Prepare a pattern for `render`."""
     padded = np.pad(pattern.reflectance, 2, constant_values=pattern.background)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
-    return Surface(
-        _lines(pattern.x_lines), _lines(pattern.y_lines), jnp.asarray(windows.reshape(-1, 9), dtype=jnp.float32)
+    neighbours = jnp.asarray(windows.reshape(-1, 9), dtype=jnp.float32)
+    return Surface(_lines(pattern.x_lines), _lines(pattern.y_lines), neighbours, _discs(pattern))
+
+
+def _discs(pattern: Pattern) -> Discs:
+    origin, pitch, last = (
+        np.array([getattr(d, name) for d in pattern.discs], np.float32).reshape(-1, 2)
+        for name in ("origin", "pitch", "count")
     )
+    radius = np.array([disc.radius for disc in pattern.discs], np.float32)
+    return Discs(*(jnp.asarray(values) for values in (origin, pitch, last - 1.0, radius)))
 
 
 def _lines(inner: np.ndarray) -> Lines:
@@ -193,7 +211,45 @@ def _shade(
         wy = _weights(y_low, y_high, y, alone * at.sigma_y)
         lines = [wx[0] * near[3 * k] + wx[1] * near[3 * k + 1] + wx[2] * near[3 * k + 2] for k in range(3)]
         total = total + np.float32(weight) * (wy[0] * lines[0] + wy[1] * lines[1] + wy[2] * lines[2])
-    return total
+    return total + (np.float32(BLACK) - total) * _disc_share(at, surface.discs) if surface.discs.radius.size else total
+
+
+class _Rim(NamedTuple):
+    """How far from the rim of the nearest disc of a lattice each pixel looks.
+
+    `outside` (m) is the signed distance, and `sigma` (m) the footprint's standard deviation, both across the rim;
+    `along` (m) is the standard deviation along it.
+    """
+
+    outside: Array
+    sigma: Array
+    along: Array
+
+
+def _rim(at: _Footprint, discs: Discs, lattice: int) -> _Rim:
+    """The rim of the nearest disc of one lattice."""
+    origin, pitch, last = discs.origin[lattice], discs.pitch[lattice], discs.last[lattice]
+    column = jnp.clip(jnp.round((at.x - origin[0]) / pitch[0]), 0.0, last[0])
+    row = jnp.clip(jnp.round((at.y - origin[1]) / pitch[1]), 0.0, last[1])
+    dx, dy = at.x - origin[0] - column * pitch[0], at.y - origin[1] - row * pitch[1]
+    distance = jnp.sqrt(dx * dx + dy * dy) + 1e-9
+    nx, ny = dx / distance * at.sigma_x, dy / distance * at.sigma_y
+    tx, ty = -dy / distance * at.sigma_x, dx / distance * at.sigma_y
+    sigma = jnp.sqrt(jnp.maximum(nx * nx + ny * ny + 2.0 * at.correlation * nx * ny, 1e-18))
+    along = jnp.sqrt(jnp.maximum(tx * tx + ty * ty + 2.0 * at.correlation * tx * ty, 1e-18))
+    return _Rim(distance - discs.radius[lattice], sigma, along)
+
+
+def _disc_share(at: _Footprint, discs: Discs) -> Array:
+    """The share of each footprint that lies on discs, to second order in the footprint's size over the radius."""
+    share = jnp.zeros_like(at.x)
+    for lattice in range(discs.radius.size):
+        rim = _rim(at, discs, lattice)
+        # The rim curves towards the disc: over the footprint's length along it, by this much on average.
+        from_centre = jnp.maximum(rim.outside + discs.radius[lattice], 0.5 * discs.radius[lattice])
+        curved = rim.outside + 0.5 * rim.along * rim.along / from_centre
+        share = share + 0.5 * (1.0 - jax.lax.erf(curved / (np.float32(np.sqrt(2.0)) * rim.sigma)))
+    return share
 
 
 def blur_px(psf_sigma_px: float) -> float:
@@ -235,4 +291,8 @@ def near_edges(
     close_y = jnp.minimum(at.y - y_low, y_high - at.y) < band_y
     inside_x = (at.x > surface.x.at[1] - band_x) & (at.x < surface.x.at[-2] + band_x)
     inside_y = (at.y > surface.y.at[1] - band_y) & (at.y < surface.y.at[-2] + band_y)
-    return inside_x & inside_y & (close_x | close_y)
+    close = close_x | close_y
+    for lattice in range(surface.discs.radius.size):
+        rim = _rim(at, surface.discs, lattice)
+        close = close | (jnp.abs(rim.outside) < band_px * rim.sigma)
+    return inside_x & inside_y & close

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from jaxcal import AprilGrid, Checkerboard
+from jaxcal.targets import Charuco, CircleGrid
 
 FINE = 6  # samples per pixel and axis
 
@@ -82,9 +83,42 @@ def draw_aprilgrid(grid: AprilGrid, to_pixel: np.ndarray, image_size: tuple[int,
             x, y = margin + col * pitch, height - margin - row * pitch  # lower left of the crossing's black square
             drawing[y - gap : y, x : x + gap] = 20
             if row < grid.rows and col < grid.cols:
-                tag = cv2.aruco.generateImageMarker(dictionary, row * grid.cols + col, edge, None, 2)
+                number = grid.first_id + row * grid.cols + col
+                tag = cv2.aruco.generateImageMarker(dictionary, number, edge, None, 2)
                 upright = np.where(np.rot90(tag, 2) > 0, 235, 20)  # Kalibr prints them turned by half a turn
                 drawing[y - gap - edge : y - gap, x + gap : x + gap + edge] = upright
     scale = edge / grid.tag_size
     to_drawing = np.array([[scale, 0, margin + gap - 0.5], [0, -scale, height - margin - gap - 0.5], [0, 0, 1.0]])
     return View(render(drawing, to_drawing, to_pixel, image_size, noise), apply(to_pixel, grid.points))
+
+
+def draw_circle_grid(grid: CircleGrid, to_pixel: np.ndarray, image_size: tuple[int, int], noise: float = 0) -> View:
+    """Black discs on white paper that reaches two spacings beyond the outer ones."""
+    cell = 100
+    scale = cell / grid.spacing
+    reach = grid.points[:, :2].max(axis=0) * scale
+    width, height = (int(np.ceil(length)) + 4 * cell for length in reach)
+    drawing = np.full((height, width), 235, np.uint8)
+    to_drawing = np.array([[scale, 0, 2 * cell], [0, -scale, height - 2 * cell], [0, 0, 1.0]])
+    fraction_bits = 6
+    radius = round(grid.circle_diameter / 2 * scale * 2**fraction_bits)
+    for centre in apply(to_drawing, grid.points):
+        at = tuple(int(v) for v in np.round(centre * 2**fraction_bits))
+        cv2.circle(drawing, at, radius, (20,), -1, cv2.LINE_AA, fraction_bits)
+    return View(render(drawing, to_drawing, to_pixel, image_size, noise), apply(to_pixel, grid.points))
+
+
+def draw_charuco(board: Charuco, to_pixel: np.ndarray, image_size: tuple[int, int], noise: float = 0) -> View:
+    """The board as OpenCV itself draws it, on white paper."""
+    cell, margin = 80, 60
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    ids = np.array(board.ids, np.int32)
+    size = (board.cols, board.rows)
+    drawn = cv2.aruco.CharucoBoard(size, board.square_size, board.marker_size, dictionary, ids)
+    drawn.setLegacyPattern(board.legacy)
+    image = drawn.generateImage((board.cols * cell, board.rows * cell), None, 0, 1)
+    drawing = np.pad(np.where(np.asarray(image) > 127, 235, 20).astype(np.uint8), margin, constant_values=235)
+    scale = cell / board.square_size
+    x, y = margin + cell - 0.5, margin + (board.rows - 1) * cell - 0.5  # of the lower left inner corner
+    to_drawing = np.array([[scale, 0, x], [0, -scale, y], [0, 0, 1.0]])
+    return View(render(drawing, to_drawing, to_pixel, image_size, noise), apply(to_pixel, board.points))
