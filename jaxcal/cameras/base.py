@@ -22,7 +22,6 @@ _LONGEST_STEP = 0.1
 _STEP_LENGTHS = np.array([1.0, 0.4, 0.1, 0.0])
 
 
-
 class CameraModel(eqx.Module):
     """A lens: maps points in the camera's frame (z forward, metres) to pixels.
 

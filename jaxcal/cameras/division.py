@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -54,3 +55,9 @@ class PinholeDivision(CameraModel):
         width, height = image_size
         centre = jnp.array([(width - 1) / 2.0, (height - 1) / 2.0])
         return cls(jnp.full(2, float(focal)), centre, jnp.asarray(0.0))
+
+    @classmethod
+    def starts(cls, focal: float, image_size: tuple[int, int]) -> tuple["CameraModel", ...]:
+        """A pinhole and a stereographic lens."""
+        first = cls.from_focal(focal, image_size)
+        return tuple(eqx.tree_at(lambda m: m.bend, first, jnp.asarray(bend)) for bend in (0.0, -0.25))

@@ -39,3 +39,11 @@ def rises_until(
     places = jnp.where(inside, angle, 0.0) * jnp.arange(1, _FOLD_SAMPLES + 1) / _FOLD_SAMPLES
     values, slopes = jax.vmap(lambda place: jax.jvp(profile, (place,), (jnp.ones_like(place),)))(places)
     return inside & jnp.all((slopes > 0.0) & (values >= 0.0))
+
+
+def keeps_orientation(
+    image: Callable[[Float[Array, "2"]], Float[Array, "2"]], plane: Float[Array, "2"]
+) -> Bool[Array, ""]:
+    """Whether a map of the plane does not mirror the neighbourhood of a point: a fold lies where it begins to."""
+    (a, b), (c, d) = jax.jacfwd(image)(plane)
+    return a * d - b * c > 0.0

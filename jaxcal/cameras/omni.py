@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxcal.cameras import distortions
 from jaxcal.cameras.base import CameraModel
-from jaxcal.cameras.numerics import at_least, length, rises_until, root
+from jaxcal.cameras.numerics import at_least, keeps_orientation, length, rises_until, root
 
 
 class OmniModel(CameraModel):
@@ -31,9 +31,11 @@ class OmniModel(CameraModel):
 
     def project(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
         """Pixel (2,) of a point (3,) in the camera frame, metres."""
+        return self.focal * self._distort(self._plane(point)) + self.centre
+
+    def _plane(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
         distance = length(point)
-        below = at_least(point[2] + self.xi * distance, 1e-6 * distance)
-        return self.focal * self._distort(point[:2] / below) + self.centre
+        return point[:2] / at_least(point[2] + self.xi * distance, 1e-6 * distance)
 
     def is_valid(self, point: Float[Array, "3"]) -> Any:
         """Whether a point (3,) has a pixel of its own (Usenko et al. 2018, eq. 8 and 9, in terms of xi)."""
@@ -91,10 +93,11 @@ class OmniRadtan(OmniModel):
         return distortions.radtan(plane, self.coefficients)
 
     def is_valid(self, point: Float[Array, "3"]) -> Any:
-        """As without distortion, and nearer to the axis than where the radial distortion folds back."""
+        """As without distortion, and nearer to the axis than where the distortion folds the image back."""
 
         def radius(angle: Float[Array, ""]) -> Float[Array, ""]:
             undistorted = jnp.sin(angle) / at_least(jnp.cos(angle) + self.xi, 1e-6)
             return undistorted * distortions.radtan_radial(undistorted**2, self.coefficients)
 
-        return super().is_valid(point) & rises_until(radius, jnp.arctan2(length(point[:2]), point[2]))
+        rises = rises_until(radius, jnp.arctan2(length(point[:2]), point[2]))
+        return super().is_valid(point) & rises & keeps_orientation(self._distort, self._plane(point))

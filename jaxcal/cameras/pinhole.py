@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxcal.cameras import distortions
 from jaxcal.cameras.base import CameraModel
-from jaxcal.cameras.numerics import at_least, length, rises_until
+from jaxcal.cameras.numerics import at_least, keeps_orientation, length, rises_until
 
 # Closer to the image plane than this angle (rad) nothing is projected: pixels there are a million focal lengths out.
 _RIM = 1e-6
@@ -33,14 +33,18 @@ class PinholeModel(CameraModel):
         return self.focal * self._distort(point[:2] / at_least(point[2], _RIM)) + self.centre
 
     def is_valid(self, point: Float[Array, "3"]) -> Any:
-        """Whether a point (3,) lies in front, nearer to the axis than where the radial distortion folds back."""
+        """Whether a point (3,) lies in front, nearer to the axis than where the distortion folds the image back.
+
+        The radial part is looked at all the way from the axis, the whole distortion at the point itself.
+        """
         angle = jnp.arctan2(length(point[:2]), point[2])
 
         def radius(angle: Float[Array, ""]) -> Float[Array, ""]:
             undistorted = jnp.tan(angle)
             return undistorted * self._radial(undistorted**2)
 
-        return rises_until(radius, angle, limit=jnp.pi / 2.0 - _RIM)
+        plane = point[:2] / at_least(point[2], _RIM)
+        return rises_until(radius, angle, limit=jnp.pi / 2.0 - _RIM) & keeps_orientation(self._distort, plane)
 
     @classmethod
     def from_focal(cls, focal: float, image_size: tuple[int, int]) -> "CameraModel":

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.cameras.base import CameraModel
-from jaxcal.cameras.numerics import at_least, length
+from jaxcal.cameras.numerics import at_least, keeps_orientation, length
 from jaxcal.errors import CalibrationError
 
 _SHORT_NAME = re.compile(r"splined-(\d+)-(\d+)-(\d+)-(\d+(?:\.\d+)?)")
@@ -78,8 +78,7 @@ class SplinedStereographic(CameraModel):
     def is_valid(self, point: Float[Array, "3"]) -> Any:
         """Whether a point (3,) lies where the surface is defined and does not fold the image there."""
         plane = _stereographic(point)
-        stretch = jnp.eye(2) + jax.jacfwd(self._surface)(plane)
-        unfolded = (stretch[0, 0] * stretch[1, 1] - stretch[0, 1] * stretch[1, 0]) > 0.0
+        unfolded = keeps_orientation(lambda u: u + self._surface(u), plane)
         return jnp.all(jnp.abs(plane) <= jnp.asarray(self.edge())) & unfolded
 
     def regularisation(self) -> Float[Array, " n"]:
