@@ -1,27 +1,167 @@
-"""A first lens and first board poses from the views of one camera alone, with no guess from the user."""
+"""A first lens and first board poses from the views of one camera alone, with no guess from the user.
 
+A sweep over lenses of all kinds (`generic_lens`) on a few views finds the field of view; the best of them are refined
+on more views, and the model that was asked for is fitted to the winner and refined on the same views.
+"""
+
+import dataclasses
 import logging
 from collections.abc import Sequence
 
 import cv2
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxcal.calibration import solving
+from jaxcal.calibration import generic_lens
 from jaxcal.calibration.assemble import CameraFrames
+from jaxcal.calibration.first_fit import Fit, Lens, Views, compact_views, fit_lenses, fit_poses, squared_errors
+from jaxcal.calibration.generic_lens import GenericLens
+from jaxcal.calibration.initial_poses import mirrored_poses, planar_poses
+from jaxcal.calibration.model_lens import ModelLens
 from jaxcal.calibration.redundancy import view_features
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
+from jaxcal.estimation.threads import single_threaded_blas
 from jaxcal.targets import Target
 
 logger = logging.getLogger(__name__)
 
-# Focal lengths tried besides the homographies' own, as fractions of the image's longer side: 112 to 20 degrees of view.
-_FOCAL_FRACTIONS = (0.35, 0.55, 0.8, 1.2, 1.9, 3.0)
-_SWEEP_VIEWS = 24
-_SWEEP_STEPS = 40
+# Views and corners per view: of the sweep, of the refinement of its best hypotheses, of the model's own.
+_SWEEP_VIEWS, _SWEEP_CORNERS = 10, 40
+_GENERIC_VIEWS, _GENERIC_CORNERS = 24, 80
+_MODEL_VIEWS = 60
+_MOST_FINALISTS = 3
+# Corner errors (px) up to which they count in full.
+_HUBER_PX = 3.0
+# Corner noise (px) taken for granted until it is known, in the scale of priors alone.
+_FIRST_NOISE_PX = 0.1
+# Information on parameters that are held: nothing that corners say comes near.
+_HELD = 1e18
+# Focal lengths tried for the requested model, relative to the one found.
+_FOCAL_FACTORS = (1.0, 0.6, 1.7)
+_POSE_STEPS = 12
+_POSE_CHUNK = 256
+
+
+@dataclasses.dataclass(frozen=True)
+class _Found:
+    """A generic lens with poses of all the views it was judged by, and which of these views it explains (F,).
+
+    `cost`, px^2, of these views and of the prior.
+    """
+
+    fit: Fit
+    good: np.ndarray
+    rms_px: float
+    cost: float
+
+
+def initial_lens(name: str, model: type[CameraModel], frames: CameraFrames, target: Target) -> CameraModel:
+    """The best lens of the requested kind that a search without a guess finds.
+
+    Raises CalibrationError when no lens explains the views, or when the requested model is far from holding the lens
+    that does.
+    """
+    size = frames.detections.image_size
+    subset = frames.take(spread_views(frames, _MODEL_VIEWS))
+    views = compact_views(target.points, subset.pixels, subset.seen)
+    with single_threaded_blas():
+        candidates = _generic_candidates(subset, target, views, size)
+        best = candidates[0]
+        logger.debug("%s: generic lenses %s", name, [(c.rms_px, c.fit.parameters[0]) for c in candidates])
+        if not best.rms_px < 0.02 * max(size):
+            raise CalibrationError(
+                f"{name}: failed, because no lens explains the views of the board: the best one misses the corners by "
+                f"{best.rms_px:.1f} px (root mean square) in {best.good.sum()} views. Check the target's size, layout "
+                "and orientation, and that the corners' indices are those of this target."
+            )
+        lens, rms_px = _requested(model, candidates, views, size)
+    if rms_px > max(0.01 * max(size), 5.0 * best.rms_px):
+        seen = generic_lens.half_field_of_view(
+            best.fit.parameters[0], views.pixels[best.good][views.weight[best.good] > 0]
+        )
+        raise CalibrationError(
+            f"{name}: failed, because {model.name or model.__name__} cannot hold this lens: it misses the corners by "
+            f"{rms_px:.1f} px (root mean square), where a generic lens misses them by {best.rms_px:.2f} px. The "
+            f"corners reach {seen:.0f} degrees from the axis: a field of view of {2 * seen:.0f}. {_advice(seen)}"
+        )
+    return lens
+
+
+def initial_lenses(
+    names: Sequence[str], models: Sequence[type[CameraModel]], cameras: Sequence[CameraFrames], target: Target
+) -> list[CameraModel]:
+    """`initial_lens` for each camera."""
+    return [initial_lens(n, m, f, target) for n, m, f in zip(names, models, cameras, strict=True)]
+
+
+def board_poses(model: CameraModel, frames: CameraFrames, target: Target) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """T_cam_target of every frame through a known lens, the better of the two poses that a flat board allows.
+
+    Returns rotations (F, 3, 3), translations (F, 3) and the root mean square error (F,), px, of each.
+    """
+    lens = ModelLens(model)
+    parameters = np.asarray(model.parameters)[None]
+    far = float(max(frames.detections.image_size))
+    parts = []
+    with single_threaded_blas():
+        generic = generic_of(model, frames.detections.image_size)
+        for first in range(0, len(frames.frames), _POSE_CHUNK):
+            part = slice(first, first + _POSE_CHUNK)
+            views = compact_views(target.points, frames.pixels[part], frames.seen[part])
+            fit = _poses_from_rays(lens, parameters, *generic_lens.unproject(generic, views.pixels), views, far)
+            squared = squared_errors(lens, fit, views, far=1e6)[0]
+            error = np.sqrt(np.sum(squared * views.weight, axis=1) / views.weight.sum(axis=1))
+            parts.append((fit.rotation[0], views.to_target(fit.rotation[0], fit.translation[0]), error))
+    rotation, translation, error = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return rotation, translation, error
+
+
+def generic_of(model: CameraModel, image_size: tuple[int, int]) -> np.ndarray:
+    """The generic lens (1, 6) nearest to a model over its image: good enough to start poses from, with no unprojection
+    of the model's own to compile or to iterate."""
+    far = float(max(image_size))
+    angle = np.deg2rad(np.geomspace(0.1, 125.0, 56))
+    around = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    rays = np.stack(
+        [
+            np.sin(angle)[:, None] * np.cos(around),
+            np.sin(angle)[:, None] * np.sin(around),
+            np.tile(np.cos(angle)[:, None], (1, len(around))),
+        ],
+        axis=-1,
+    )
+    seen = ModelLens(model).project(
+        np.asarray(model.parameters)[None], rays.reshape(1, 1, -1, 3).swapaxes(-1, -2), False
+    )
+    pixels = seen.pixels[0, 0].T.reshape(*rays.shape[:-1], 2)
+    # Outwards until the lens ends or folds back.
+    radius = np.linalg.norm(pixels - pixels[0].mean(axis=0), axis=-1)
+    outwards = np.diff(radius, axis=0, prepend=0.0) > 0.0
+    inside = np.all((pixels > -0.05 * far) & (pixels < np.array(image_size) + 0.05 * far), axis=-1)
+    real = np.cumprod(outwards & seen.valid[0, 0].reshape(radius.shape), axis=0) * inside
+    views = Views(
+        rays.reshape(1, -1, 3), pixels.reshape(1, -1, 2), real.reshape(1, -1).astype(np.float64), np.zeros(3), 1.0
+    )
+    parameters = generic_lens.hypotheses(pixels[real > 0], image_size, None)
+    count = len(parameters)
+    start = Fit(parameters, np.tile(np.eye(3), (count, 1, 1, 1)), np.zeros((count, 1, 3)), np.full(count, np.inf))
+    prior = generic_lens.weak_prior(image_size, _FIRST_NOISE_PX)
+    fit = fit_lenses(GenericLens(), start, views, steps=20, width=_HUBER_PX, cap=far, prior=prior, hold_poses=True)
+    return fit.parameters[[int(np.argmin(fit.cost))]]
+
+
+def spread_views(frames: CameraFrames, count: int) -> np.ndarray:
+    """Indices of up to `count` views, far apart in the board's place, size and shape in the image (greedy, exact ties
+    by index, so that it is deterministic)."""
+    if len(frames.frames) <= count:
+        return np.arange(len(frames.frames))
+    features = view_features(frames)
+    chosen = [int(np.argmax(frames.seen.sum(axis=1)))]
+    distance = np.full(len(features), np.inf)
+    while len(chosen) < count:
+        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
+        chosen.append(int(np.argmax(distance)))
+    return np.sort(np.array(chosen))
 
 
 def homography_focal(frames: CameraFrames, target: Target) -> float | None:
@@ -48,112 +188,175 @@ def homography_focal(frames: CameraFrames, target: Target) -> float | None:
     return float(focal) if 0.1 * width < focal < 20.0 * width else None
 
 
-@eqx.filter_jit
-def _unproject(model: CameraModel, pixels: jax.Array) -> jax.Array:
-    return model.unproject(pixels)
+# --- poses -----------------------------------------------------------------------------------------------------------
 
 
-@eqx.filter_jit
-def _project(model: CameraModel, rotations: jax.Array, translations: jax.Array, points: jax.Array) -> jax.Array:
-    return model.project(jnp.einsum("fij,nj->fni", rotations, points) + translations[:, None])
+def _poses_from_rays(
+    lens: Lens, parameters: np.ndarray, rays: np.ndarray, valid: np.ndarray, views: Views, size: float
+) -> Fit:
+    """Poses of all views for lenses (B, n) from rays (B, F, N, 3), `valid` (B, F, N): the better of both."""
+    weight = views.weight * valid
+    weight = np.where(weight.sum(axis=-1, keepdims=True) >= 6, weight, views.weight)
+    rotation, translation = planar_poses(views.points, rays, weight)
+    fit = Fit(parameters, rotation, translation, np.full(len(parameters), np.inf))
+    fit, cost = fit_poses(lens, fit, views, steps=_POSE_STEPS, width=_HUBER_PX, cap=0.25 * size)
+    return _better_of_mirrored(lens, fit, cost, views, size)[0]
 
 
-def board_poses(model: CameraModel, frames: CameraFrames, target: Target) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """T_cam_target of every frame by planar pose estimation (IPPE, Collins & Bartoli 2014).
-
-    Returns rotations (F, 3, 3), translations (F, 3) and the root mean square error (F,), px, of each. Of IPPE's two
-    solutions the one with the smaller reprojection error through the whole lens is taken.
-    """
-    points = target.points
-    padded = -(-len(frames.frames) // 64) * 64 - len(frames.frames)  # few shapes to compile
-    pixels = np.pad(frames.pixels, [(0, padded), (0, 0), (0, 0)])
-    rays = np.asarray(_unproject(model, jnp.asarray(pixels)))[: len(frames.frames)]
-    candidates = np.tile(np.eye(4)[:3], (2, len(pixels), 1, 1))
-    for f, seen in enumerate(frames.seen):
-        ahead = seen & (rays[f, :, 2] > 0.05)
-        if ahead.sum() < 4:
-            ahead = seen
-        plane = rays[f, ahead, :2] / np.maximum(rays[f, ahead, 2:], 0.05)
-        solutions = _planar_poses(points[ahead], plane)
-        for s in range(2):
-            candidates[s, f] = solutions[min(s, len(solutions) - 1)]
-    errors = np.full((2, len(frames.frames)), np.inf)
-    for s in range(2):
-        projected = np.asarray(
-            _project(
-                model, jnp.asarray(candidates[s, :, :, :3]), jnp.asarray(candidates[s, :, :, 3]), jnp.asarray(points)
-            )
-        )[: len(frames.frames)]
-        squared = np.sum((projected - frames.pixels) ** 2, axis=-1)
-        squared = np.where(np.isfinite(squared), np.minimum(squared, 1e12), 1e12)
-        errors[s] = np.sqrt(np.sum(squared * frames.seen, axis=1) / frames.seen.sum(axis=1))
-    best = np.argmin(errors, axis=0)
-    chosen = candidates[best, np.arange(len(best))]
-    return chosen[:, :, :3], chosen[:, :, 3], errors[best, np.arange(len(best))]
-
-
-def _planar_poses(points: np.ndarray, plane: np.ndarray) -> list[np.ndarray]:
-    """Up to two poses (3, 4) of planar points (n, 3) from their normalised image (n, 2)."""
-    count, rotations, translations, _ = cv2.solvePnPGeneric(
-        points, np.ascontiguousarray(plane), np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE
+def _better_of_mirrored(lens: Lens, fit: Fit, cost: np.ndarray, views: Views, size: float) -> tuple[Fit, np.ndarray]:
+    """The fit with every pose that its mirror image beats replaced, and which ones were (B, F)."""
+    middle = (
+        np.sum(views.points * views.weight[..., None], axis=-2) / np.maximum(views.weight.sum(axis=-1), 1.0)[:, None]
     )
-    poses = []
-    for s in range(count):
-        rotation, _ = cv2.Rodrigues(rotations[s])
-        poses.append(np.concatenate([rotation, np.asarray(translations[s]).reshape(3, 1)], axis=1))
-    if not poses or not all(np.isfinite(pose).all() for pose in poses):
-        depth = np.ptp(points[:, :2], axis=0).max() / max(np.ptp(plane, axis=0).max(), 1e-3)
-        facing = np.diag([1.0, -1.0, -1.0])
-        centre = np.append(plane.mean(axis=0), 1.0) * depth
-        return [np.concatenate([facing, (centre - facing @ points.mean(axis=0))[:, None]], axis=1)]
-    return poses
+    rotation, translation = mirrored_poses(fit.rotation, fit.translation, middle)
+    other = Fit(fit.parameters, rotation, translation, fit.cost)
+    other, other_cost = fit_poses(lens, other, views, steps=_POSE_STEPS, width=_HUBER_PX, cap=0.25 * size)
+    swap = other_cost < cost - 1e-9 * np.abs(cost)
+    merged = Fit(
+        fit.parameters,
+        np.where(swap[..., None, None], other.rotation, fit.rotation),
+        np.where(swap[..., None], other.translation, fit.translation),
+        np.where(swap, other_cost, cost).sum(axis=-1),
+    )
+    return merged, swap
 
 
-def spread_views(frames: CameraFrames, count: int) -> np.ndarray:
-    """Indices of up to `count` views, far apart in the board's place, size and shape in the image (greedy, exact ties
-    by index, so that it is deterministic)."""
-    if len(frames.frames) <= count:
-        return np.arange(len(frames.frames))
-    features = view_features(frames)
-    chosen = [int(np.argmax(frames.seen.sum(axis=1)))]
-    distance = np.full(len(features), np.inf)
-    while len(chosen) < count:
-        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
-        chosen.append(int(np.argmax(distance)))
-    return np.sort(np.array(chosen))
+# --- the generic lens ------------------------------------------------------------------------------------------------
 
 
-def initial_lens(name: str, model: type[CameraModel], frames: CameraFrames, target: Target) -> CameraModel:
-    """The best lens over a sweep of focal lengths, each refined on some well-spread views.
+def _generic_candidates(frames: CameraFrames, target: Target, views: Views, size: tuple[int, int]) -> list[_Found]:
+    """Generic lenses with the poses of `views`, the best first."""
+    lens = GenericLens()
+    prior = generic_lens.weak_prior(size, _FIRST_NOISE_PX)
+    far = float(max(size))
+    swept = spread_views(frames, _SWEEP_VIEWS)
+    thin = compact_views(target.points, frames.pixels, frames.seen, _SWEEP_CORNERS)
+    few = thin.take(swept)
+    parameters = generic_lens.hypotheses(few.pixels[few.weight > 0], size, homography_focal(frames.take(swept), target))
+    fit = _poses_from_rays(lens, parameters, *generic_lens.unproject(parameters, few.pixels), few, far)
+    for share, steps in ((0.6, 8), (0.6, 12)):
+        width = _loss_width(lens, fit, few, share, far)
+        fit = fit_lenses(lens, fit, few, steps=steps, width=width, cap=0.25 * far, prior=prior, rtol=1e-3)
 
-    Raises CalibrationError when none explains the views.
-    """
-    width, height = frames.detections.image_size
-    subset = frames.take(spread_views(frames, _SWEEP_VIEWS))
-    own = homography_focal(subset, target)
-    focals = ([own] if own else []) + [fraction * max(width, height) for fraction in _FOCAL_FRACTIONS]
-    best: tuple[float, CameraModel] | None = None
-    for focal in focals:
-        start = model.from_focal(focal, (width, height))
-        rotations, translations, _ = board_poses(start, subset, target)
-        refined, cost = solving.refine_single(start, subset, target, rotations, translations, max_steps=_SWEEP_STEPS)
-        plausible = np.isfinite(cost) and np.all(np.asarray(refined.intrinsics[:2]) > 0.05 * width)
-        logger.debug("%s: focal %.0f px -> cost %.4g, intrinsics %s", name, focal, cost, refined.intrinsics)
-        if plausible and (best is None or cost < best[0] * (1 - 1e-6)):
-            best = (cost, refined)
-        # Most views well under a pixel: another focal length cannot explain them much better.
-        if best is not None and best[0] < 0.5 * 2 * subset.seen.sum() * 0.5**2:
+    more = thin.take(spread_views(frames, _GENERIC_VIEWS))
+    order = np.argsort(_score(lens, fit, few, far), kind="stable")[: 2 * _MOST_FINALISTS]
+    fit = _poses_from_rays(
+        lens, fit.parameters[order], *generic_lens.unproject(fit.parameters[order], more.pixels), more, far
+    )
+    order = _finalists(_score(lens, fit, more, far), fit.parameters)
+    fit = fit.take(order)
+    fit = fit_lenses(
+        lens, fit, more, steps=30, width=_loss_width(lens, fit, more, 0.6, far), cap=0.25 * far, prior=prior
+    )
+    found = [_extended(lens, fit.parameters[b : b + 1], views, size) for b in range(len(order))]
+    # Where several explain the views equally well, the prior in their costs decides.
+    return sorted(found, key=lambda f: (f.rms_px > 1.5 * min(g.rms_px for g in found), f.cost))
+
+
+def _extended(lens: Lens, parameters: np.ndarray, views: Views, size: tuple[int, int]) -> _Found:
+    """One hypothesis on all views: poses, which views it explains, and the lens refined on these."""
+    far = float(max(size))
+    fit = _poses_from_rays(lens, parameters, *generic_lens.unproject(parameters, views.pixels), views, far)
+    for _ in range(3):
+        good = _explained(lens, fit, views, far)
+        kept = views.with_weight(views.weight * good[:, None])
+        rms_px = _trimmed_rms(lens, fit, kept, far)
+        prior = generic_lens.weak_prior(size, max(rms_px, 0.05))
+        fit = fit_lenses(lens, fit, kept, steps=15, width=_HUBER_PX, cap=0.25 * far, prior=prior)
+        found = _Found(fit, good, rms_px, float(fit.cost[0]))
+        fit, swapped = _swap_mirrored(lens, fit, views, far)
+        if not swapped:
             break
-    if best is None:
-        raise CalibrationError(
-            f"{name}: no focal length between {min(focals):.0f} and {max(focals):.0f} px explains the views of the "
-            "board. Check the target's size and layout, and the camera model (a fisheye needs 'pinhole-equi')."
-        )
-    return best[1]
+    return dataclasses.replace(found, fit=fit, rms_px=_trimmed_rms(lens, fit, kept, far))
 
 
-def initial_lenses(
-    names: Sequence[str], models: Sequence[type[CameraModel]], cameras: Sequence[CameraFrames], target: Target
-) -> list[CameraModel]:
-    """`initial_lens` for each camera."""
-    return [initial_lens(n, m, f, target) for n, m, f in zip(names, models, cameras, strict=True)]
+def _swap_mirrored(lens: Lens, fit: Fit, views: Views, far: float) -> tuple[Fit, bool]:
+    fit, cost = fit_poses(lens, fit, views, steps=3, width=_HUBER_PX, cap=0.25 * far)
+    fit, swap = _better_of_mirrored(lens, fit, cost, views, far)
+    return fit, bool(swap.any())
+
+
+def _loss_width(lens: Lens, fit: Fit, views: Views, share: float, far: float) -> np.ndarray:
+    """Huber widths (B,) at which `share` of the corners count in full; a hypothesis far off is judged by most."""
+    errors = np.sqrt(squared_errors(lens, fit, views, far))[:, views.weight > 0]
+    return np.maximum(np.quantile(errors, share, axis=1), _HUBER_PX)
+
+
+def _score(lens: Lens, fit: Fit, views: Views, far: float) -> np.ndarray:
+    """What a hypothesis misses the corners by (B,), px: the mean over the better four fifths of the views' medians."""
+    errors = np.sqrt(squared_errors(lens, fit, views, far))
+    errors = np.where(views.weight > 0, errors, np.nan)
+    medians = np.sort(np.nanmedian(errors, axis=-1), axis=1)
+    return medians[:, : max(int(np.ceil(0.8 * medians.shape[1])), 1)].mean(axis=1)
+
+
+def _finalists(score: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """Hypotheses within reach of the best, different ones only."""
+    chosen: list[int] = []
+    for b in np.argsort(score, kind="stable"):
+        if score[b] > 3.0 * score.min() + 0.3:
+            break
+        alike = [np.all(np.abs(parameters[b] - parameters[c])[[0, 4]] < (0.02, 0.05)) for c in chosen]
+        if not any(alike):
+            chosen.append(int(b))
+    return np.array(chosen[:_MOST_FINALISTS])
+
+
+def _explained(lens: Lens, fit: Fit, views: Views, far: float) -> np.ndarray:
+    """Views (F,) whose median error is not far above that of most views."""
+    errors = np.sqrt(squared_errors(lens, fit, views, far)[0])
+    median = np.nanmedian(np.where(views.weight > 0, errors, np.nan), axis=-1)
+    return median <= max(5.0 * float(np.median(median)), 0.003 * far)
+
+
+def _trimmed_rms(lens: Lens, fit: Fit, views: Views, far: float) -> float:
+    """Root mean square error of the better nine tenths of the corners (their lengths), px."""
+    squared = np.sort(squared_errors(lens, fit, views, far)[0][views.weight > 0])
+    return float(np.sqrt(squared[: max(int(0.9 * len(squared)), 1)].mean())) if len(squared) else np.inf
+
+
+# --- the requested model ---------------------------------------------------------------------------------------------
+
+
+def _requested(
+    model: type[CameraModel], candidates: Sequence[_Found], views: Views, size: tuple[int, int]
+) -> tuple[CameraModel, float]:
+    """The requested model fitted to the generic lens' views, from several starts while it is worse than that lens."""
+    best: tuple[float, float, CameraModel] | None = None
+    for found in candidates:
+        focal = float(np.exp(found.fit.parameters[0, 0]))
+        kept = views.with_weight(views.weight * found.good[:, None])
+        for start in (s for factor in _FOCAL_FACTORS for s in model.starts(focal * factor, size)):
+            fit = _fit_model(start, found.fit, kept, float(max(size)))
+            rms_px = _trimmed_rms(ModelLens(start), fit, kept, float(max(size)))
+            logger.debug("%s: %.3f px, cost %.6g, %s", model.name, rms_px, fit.cost[0], fit.parameters[0])
+            if best is None or fit.cost[0] < best[0]:
+                best = (float(fit.cost[0]), rms_px, start.with_parameters(fit.parameters[0]))
+            if best[1] < 1.3 * found.rms_px + 0.05:
+                return best[2], best[1]
+    assert best is not None
+    return best[2], best[1]
+
+
+def _fit_model(start: CameraModel, generic: Fit, views: Views, far: float) -> Fit:
+    """The lens alone on the generic lens' poses, ever more of the image with it, then everything together."""
+    lens = ModelLens(start)
+    information = np.array(start.regularisation())
+    information[list(start.held)] = _HELD
+    prior = (np.asarray(start.parameters), information)
+    fit = Fit(np.asarray(start.parameters)[None], generic.rotation, generic.translation, np.array([np.inf]))
+    for cap in (0.05 * far, 0.25 * far, far):
+        fit = fit_lenses(lens, fit, views, steps=15, width=0.02 * far, cap=cap, prior=prior, hold_poses=True, rtol=1e-2)
+    for _ in range(3):
+        fit = fit_lenses(lens, fit, views, steps=40, width=_HUBER_PX, cap=far, prior=prior)
+        fit, swapped = _swap_mirrored(lens, fit, views, far)
+        if not swapped:
+            break
+    return fit
+
+
+def _advice(half_degrees: float) -> str:
+    """What to do about a lens of this field of view, which the model asked for cannot hold."""
+    if half_degrees > 60.0:
+        return "Use 'pinhole-equi', 'ds-none', 'eucm-none' or 'omni-radtan', which are made for such lenses."
+    return "Use a model with distortion ('pinhole-radtan', or 'pinhole-equi' for a fisheye)."

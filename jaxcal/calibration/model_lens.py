@@ -1,0 +1,87 @@
+"""Any camera model as the lens of a small fit: two compiled programs of one fixed size serve all its calls."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxcal.calibration.generic_lens import Projection
+from jaxcal.cameras import CameraModel
+
+# Points per call: large enough to vectorise, small enough that padding costs nothing.
+_CHUNK = 4096
+
+
+class ModelLens:
+    """A camera model's class, as a `first_fit.Lens`; the model given only lends its shape."""
+
+    def __init__(self, template: CameraModel) -> None:
+        self._template = template
+
+    def project(self, parameters: np.ndarray, points: np.ndarray, with_lens: bool) -> Projection:
+        """Project points (B, F, 3, N), camera frame, through lenses (B, n)."""
+        each = [self._project_one(*pair, with_lens) for pair in zip(parameters, points, strict=True)]
+        by_lens = [one.by_lens for one in each if one.by_lens is not None]
+        return Projection(
+            np.stack([one.pixels for one in each]),
+            np.stack([one.by_point for one in each]),
+            np.stack(by_lens) if by_lens else None,
+            np.stack([one.valid for one in each]),
+        )
+
+    def _project_one(self, parameters: np.ndarray, points: np.ndarray, with_lens: bool) -> Projection:
+        count, corners = points.shape[0], points.shape[-1]
+        flat = points.swapaxes(-1, -2).reshape(-1, 3)
+        outputs = []
+        for chunk in _chunks(flat, fill=1.0):
+            program = _with_lens if with_lens else _without_lens
+            outputs.append(program(self._template, jnp.asarray(parameters), jnp.asarray(chunk)))
+
+        def joined(part: int) -> np.ndarray:
+            values = np.concatenate([np.asarray(output[part]) for output in outputs], axis=-1)[..., : len(flat)]
+            values = values.reshape(*values.shape[:-1], count, corners)
+            return np.ascontiguousarray(np.moveaxis(values, -2, 0))
+
+        return Projection(joined(0), joined(1), joined(3) if with_lens else None, joined(2))
+
+
+def _chunks(rows: np.ndarray, fill: float) -> list[np.ndarray]:
+    padded = np.pad(rows, [(0, -len(rows) % _CHUNK), (0, 0)], constant_values=fill)
+    return np.split(padded, max(len(padded) // _CHUNK, 1))
+
+
+def _point(template: CameraModel, parameters: Array, point: Array) -> tuple[Array, Array]:
+    model = template.with_parameters(parameters)
+    return model.project(point), jnp.asarray(model.is_valid(point))
+
+
+@eqx.filter_jit
+def _with_lens(template: CameraModel, parameters: Array, points: Array) -> tuple[Array, Array, Array, Array]:
+    """Pixels (2, M), Jacobian by the point (2, 3, M), validity (M), Jacobian by the lens (n, 2, M); all finite."""
+
+    def one(point: Array) -> tuple[Array, Array, Array, Array]:
+        pixel, valid = _point(template, parameters, point)
+        by_lens, by_point = jax.jacrev(lambda *at: _point(template, *at)[0], argnums=(0, 1))(parameters, point)
+        return _finite(pixel, by_point, valid, by_lens.T)
+
+    return jax.vmap(one, out_axes=-1)(points)
+
+
+@eqx.filter_jit
+def _without_lens(template: CameraModel, parameters: Array, points: Array) -> tuple[Array, Array, Array]:
+    """As `_with_lens`, less the Jacobian by the lens."""
+
+    def one(point: Array) -> tuple[Array, Array, Array]:
+        pixel, valid = _point(template, parameters, point)
+        by_point = jax.jacrev(lambda at: _point(template, parameters, at)[0])(point)
+        return _finite(pixel, by_point, valid, jnp.zeros(0))[:3]
+
+    return jax.vmap(one, out_axes=-1)(points)
+
+
+def _finite(pixel: Array, by_point: Array, valid: Array, by_lens: Array) -> tuple[Array, Array, Array, Array]:
+    """The same with zeros for what is not finite, which is then not valid either."""
+    for part in (pixel, by_point, by_lens):
+        valid = valid & jnp.all(jnp.isfinite(part))
+    return jnp.where(valid, pixel, 0.0), jnp.where(valid, by_point, 0.0), valid, jnp.where(valid, by_lens, 0.0)
