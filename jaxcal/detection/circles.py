@@ -89,8 +89,11 @@ def _blob_parameters(image: np.ndarray, count: int) -> cv2.SimpleBlobDetector.Pa
 
 def _numbered(grid: np.ndarray, target: CircleGrid) -> np.ndarray | None:
     """The centres (N, 2) in the target's order; None where no order shows the board from its front."""
-    # OpenCV sometimes starts an asymmetric grid with a shifted row.
-    starts = [start.reshape(-1, 2) for start in (grid, grid[:, ::-1])]
+    # OpenCV sometimes starts an asymmetric grid with a shifted row, or takes each pair of rows in reverse.
+    starts = [grid.reshape(-1, 2), grid[:, ::-1].reshape(-1, 2)]
+    if target.rows % 2 == 0:
+        pairs = grid.reshape(target.rows // 2, 2, target.cols, 2)[:, ::-1].reshape(grid.shape)
+        starts += [pairs.reshape(-1, 2), pairs[:, ::-1].reshape(-1, 2)]
     lattices = [start for start in starts if _is_grid(start, target)]
     if not lattices:
         return None

@@ -22,8 +22,8 @@ class BoardSet(Target):
     `points` are those of all boards one after the other, each board's in its OWN frame; `board_of_point` says whose
     a point is. A set has no grid: ask each of its `boards` for its `grid_shape`.
 
-    Boards must be told apart in an image: AprilGrids and ChArUco boards by ids that do not overlap, checkerboards and
-    circle grids by their numbers of rows and columns. Raises CalibrationError where they cannot be.
+    Boards must be told apart in an image: AprilGrids and ChArUco boards by ids that do not overlap; of checkerboards
+    and of circle grids there can be one each. Raises CalibrationError where they cannot be.
     """
 
     members: tuple[Target, ...]
@@ -70,9 +70,8 @@ def _confused(one: Target, other: Target) -> str:
                 "(and print it so)."
             )
         return ""
-    plain = type(one) is type(other) and isinstance(one, Checkerboard | CircleGrid)
-    if plain and sorted(one.grid_shape) == sorted(other.grid_shape):
-        return "they have equal numbers of rows and columns. Use boards of different shape, or with tags."
+    if type(one) is type(other) and isinstance(one, Checkerboard | CircleGrid):
+        return "a part of the larger one looks like the other. Use one of them, and boards with tags beside it."
     return ""
 
 
