@@ -97,8 +97,7 @@ def calibrate_camera_imu(
         progress=progress,
         reweigh=_reweigh_imu(data, grid) if imu_noise == "at least given" else None,
     )
-    num_intrinsics = [lens.num_intrinsics for lens in lenses]
-    covariance, chain, sentences = chain_covariance_and_sentences(fit, names, num_intrinsics)
+    covariance, chain, sentences = chain_covariance_and_sentences(fit, names, lenses)
     result = _imu_calibration(fit, imu, imu_time, data, slots, samples, chain, grid)
     settings = {
         "job": "calibrate_camera_imu",
@@ -205,11 +204,11 @@ def _problem(
     intrinsics: str,
 ) -> RigProblem:
     layout = layout_of(list(lenses))
-    free = np.ones(layout.size, dtype=bool)
+    free = solving.free_coordinates(lenses, layout)
     if intrinsics == "held":
         for c in range(layout.num_cameras):
             free[layout.lens(c)] = False
-    prior = solving.no_prior(layout)
+    prior = solving.lens_prior(lenses, layout)
     if intrinsics == "prior" and cameras is not None:
         prior = _lens_prior(cameras, layout)
     return RigProblem(

@@ -6,19 +6,20 @@ from typing import Any
 import numpy as np
 
 from jaxcal.calibration import outliers, uncertainty
-from jaxcal.calibration.assemble import CameraFrames
+from jaxcal.calibration.assemble import CameraFrames, split_groups
 from jaxcal.calibration.checks import versions
-from jaxcal.calibration.robust import RobustFit
-from jaxcal.calibration.state import camera_model_of, transform
-from jaxcal.results import Calibration, CameraCalibration, ImuCalibration
+from jaxcal.calibration.robust import RobustFit, camera_poses
+from jaxcal.calibration.state import RigState, SharedLayout, camera_model_of, transform
+from jaxcal.cameras import CameraModel
+from jaxcal.results import Calibration, CameraCalibration, ImuCalibration, TargetShape
 from jaxcal.targets import Target
 
 
 def chain_covariance_and_sentences(
-    fit: RobustFit, names: Sequence[str], num_intrinsics: Sequence[int]
+    fit: RobustFit, names: Sequence[str], models: Sequence[CameraModel]
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Covariance of shared parameters, marginal covariance of the chain, sentences on what is unobserved."""
-    labels = uncertainty.labels_of(names, fit.problem.layout, num_intrinsics)
+    labels = uncertainty.labels_of(names, models, fit.problem.layout)
     covariance, chain, sentences = uncertainty.shared_covariance(
         fit.result.equations, np.asarray(fit.problem.free), labels
     )
@@ -46,12 +47,17 @@ def calibration_from(
     imu: ImuCalibration | None,
     warnings: Sequence[str],
     settings: Mapping[str, Any],
+    with_time: bool = True,
 ) -> Calibration:
-    """Assemble the result; `covariance` (P, P) is that of the shared tangent vector."""
+    """Assemble the result; `covariance` (P, P) is that of the shared tangent vector, `with_time` whether time shifts
+    were estimated."""
     state, layout = fit.state, fit.problem.layout
     models = [camera_model_of(state, layout, fit.problem.templates, c) for c in range(layout.num_cameras)]
     num_intrinsics = [model.num_intrinsics for model in models]
-    blocks, named = uncertainty.named_covariance(names, layout, state, covariance, num_intrinsics, imu is not None)
+    blocks, named = uncertainty.named_covariance(
+        names, layout, state, covariance, num_intrinsics, with_imu=imu is not None, with_time=with_time
+    )
+    poses = split_groups(layout, cameras, [np.asarray(part) for part in camera_poses(fit.problem, state)])
     T_cam_rig = [transform(np.asarray(R), np.asarray(t)) for R, t in zip(state.R_cam_rig, state.t_cam_rig, strict=True)]
     seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]
     results = []
@@ -69,6 +75,8 @@ def calibration_from(
                 residuals_px=frames.per_corner(errors, np.nan),
                 inlier=frames.per_corner(fit.kept[c], False),
                 corner_sigma_px=fit.sigmas[c],
+                T_cam_target=_per_timestamp(poses[c], frames, usable[c]),
+                timeshift_cam_cam0=float(state.shift[c]) if with_time and imu is None else None,
             )
         )
     sentences = [*warnings, *outliers.rejection_warnings(names, seen, fit.kept)]
@@ -87,4 +95,26 @@ def calibration_from(
         settings=dict(settings),
         versions=versions(),
         converged=bool(fit.result.converged),
+        target_shape=_target_shape(state, layout),
+    )
+
+
+def _per_timestamp(poses: np.ndarray, frames: CameraFrames, usable: np.ndarray) -> np.ndarray:
+    out = np.full((len(frames.detections.timestamps_ns), 4, 4), np.nan)
+    out[frames.frames[usable]] = poses[usable]
+    return out
+
+
+def _target_shape(state: RigState, layout: SharedLayout) -> TargetShape | None:
+    if not layout.target_size:
+        return None
+    found = state.target
+    boards = [
+        transform(np.asarray(R), np.asarray(t))
+        for R, t in zip(*(found.R_target_board, found.t_target_board), strict=True)
+    ]
+    return TargetShape(
+        T_target_board=np.stack([np.eye(4), *boards]),
+        warp_m=np.asarray(found.warp) if layout.warp else None,
+        offsets_m=np.asarray(found.offsets) if layout.offsets else None,
     )

@@ -1,7 +1,5 @@
 """The calibration of a rig as one block-arrow least-squares problem, with or without IMU."""
 
-import functools
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -82,6 +80,14 @@ class RigProblem(eqx.Module):
         """The target's points, m."""
         return target_points(self.geometry, state.target).T
 
+    def target_arrays(self, state: RigState) -> tuple[Float[Array, "3 N"], Float[Array, "T 3 N"]]:
+        """The target's points, m, and their derivative by the target's unknowns."""
+        return self.points(state), points_by_target(self.geometry, state.target, self.layout)
+
+    def robust(self, squared: Array) -> tuple[Array, Array]:
+        """The robust loss of squared whitened residuals and its weight."""
+        return robust_loss(self.loss, squared, self.loss_width)
+
     def corner_errors(self, state: RigState) -> tuple[Float[Array, "_ N 2"], ...]:
         """Projection minus measurement of every corner, px, per group."""
         points = self.points(state)
@@ -90,8 +96,12 @@ class RigProblem(eqx.Module):
             for g, data in enumerate(self.corners)
         )
 
+    def camera_poses(self, state: RigState) -> tuple[Float[Array, "_ 4 4"], ...]:
+        """T_cam_target of every frame, per group."""
+        return tuple(vision.frame_transforms(state, data, self.poses(state, data)) for data in self.corners)
+
     def _vision(self, state: RigState) -> BlockArrow:
-        points, by_target = self.points(state), points_by_target(self.geometry, state.target, self.layout)
+        points, by_target = self.target_arrays(state)
         intervals = state.positions.shape[0] - self.order + 1
         targets = self.layout.target_size
         window = jnp.zeros((intervals, self.order, 6, self.order, 6))
@@ -103,8 +113,9 @@ class RigProblem(eqx.Module):
         cost = jnp.zeros(())
         for group, data in enumerate(self.corners):
             poses = self.poses(state, data)
-            loss = functools.partial(robust_loss, self.loss, width=self.loss_width)
-            frames = vision.linearise_frames(self.templates[group], state, data, poses, group, points, by_target, loss)
+            frames = vision.linearise_frames(
+                self.templates[group], state, data, poses, group, points, by_target, self.robust
+            )
             window = window.at[poses.start].add(frames.window)
             gradient_window = gradient_window.at[poses.start].add(frames.gradient_window)
             cost = cost + frames.cost
@@ -115,7 +126,7 @@ class RigProblem(eqx.Module):
                 border_target = border_target.at[poses.start].add(frames.cross[..., 7 + lens :])
             for place, camera in enumerate(members):
                 borders[camera] = jnp.concatenate([border[place, ..., 7:], border[place, ..., :7]], axis=-1)
-                columns = self._columns(camera)
+                columns = self.columns(camera)
                 shared = shared.at[columns[:, None], columns].add(frames.shared[place])
                 gradient = gradient.at[columns].add(frames.gradient_shared[place])
 
@@ -131,7 +142,7 @@ class RigProblem(eqx.Module):
             cost=cost,
         )
 
-    def _columns(self, camera: int) -> np.ndarray:
+    def columns(self, camera: int) -> np.ndarray:
         """Where the shared coordinates of a frame's equations stand: extrinsics, shift, lens, target."""
         layout = self.layout
         ranges = (layout.pose(camera), slice(layout.shift(camera), layout.shift(camera) + 1), layout.lens(camera))

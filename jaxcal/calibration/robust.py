@@ -48,6 +48,12 @@ def corner_errors(problem: RigProblem, state: RigState) -> tuple:
     return problem.corner_errors(state)
 
 
+@eqx.filter_jit
+def camera_poses(problem: RigProblem, state: RigState) -> tuple:
+    """T_cam_target (F, 4, 4) of every frame, per group."""
+    return problem.camera_poses(state)
+
+
 def robust_fit(
     problem: RigProblem,
     state: RigState,

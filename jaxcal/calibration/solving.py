@@ -2,15 +2,16 @@
 
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.calibration.assemble import CameraFrames, round_up, vision_data
+from jaxcal.calibration.poses import Poses
 from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.state import (
     RigState,
     SharedLayout,
-    TargetState,
     camera_model_of,
     flat_target,
     layout_of,
@@ -23,13 +24,25 @@ from jaxcal.targets import Target
 _VIEW_STEP = 8
 
 
-def no_prior(layout: SharedLayout) -> LensPrior:
-    """Lenses of which nothing is known beforehand."""
-    sizes = [(len(members), layout.sizes[members[0]]) for members in layout.groups]
+def lens_prior(models: Sequence[CameraModel], layout: SharedLayout) -> LensPrior:
+    """What the models themselves ask for (`CameraModel.regularisation`); nothing for most."""
     return LensPrior(
-        mean=tuple(jnp.zeros(shape) for shape in sizes),
-        information=tuple(jnp.zeros((c, n, n)) for c, n in sizes),
+        mean=tuple(
+            jnp.stack([type(models[c]).from_focal(1.0, (2, 2)).parameters for c in members])
+            for members in layout.groups
+        ),
+        information=tuple(
+            jnp.stack([jnp.diag(models[c].regularisation()) for c in members]) for members in layout.groups
+        ),
     )
+
+
+def free_coordinates(models: Sequence[CameraModel], layout: SharedLayout) -> np.ndarray:
+    """Which shared coordinates (P,) may be estimated: all but those that the models hold."""
+    free = np.ones(layout.size, dtype=bool)
+    for c, model in enumerate(models):
+        free[layout.start(c) + np.asarray(model.held, dtype=int)] = False
+    return free
 
 
 def templates_of(models: Sequence[CameraModel], layout: SharedLayout) -> tuple[CameraModel, ...]:
@@ -53,16 +66,24 @@ def camera_problem(
     T_target_rig: tuple[np.ndarray, np.ndarray],
     loss_width: float,
     layout: SharedLayout | None = None,
-    target_state: TargetState | None = None,
+    boards: Poses | None = None,
+    offset_sigma_m: float | None = None,
     loss: str = "huber",
 ) -> tuple[RigProblem, RigState]:
-    """Problem and start of a camera-only calibration; cam0's pose in the rig, time shifts and gravity are held."""
+    """Problem and start of a camera-only calibration; cam0's pose in the rig, time shifts and gravity are held.
+
+    `boards` are first poses T_target_board of all boards but the first; `offset_sigma_m` is for points that may move.
+    """
     layout = layout or layout_of(list(models))
-    free = np.ones(layout.size, dtype=bool)
+    free = free_coordinates(models, layout)
     free[layout.pose(0)] = False
     free[layout.gravity] = False
     free[[layout.shift(c) for c in range(layout.num_cameras)]] = False
 
+    target_state = flat_target(layout)
+    if boards is not None and len(boards[0]):
+        placed = (jnp.asarray(boards[0]), jnp.asarray(boards[1]))
+        target_state = eqx.tree_at(lambda t: (t.R_target_board, t.t_target_board), target_state, placed)
     count = len(T_target_rig[0])
     padding = round_up(count, _VIEW_STEP) - count
     free_chain = np.zeros((count + padding, 6), dtype=bool)
@@ -73,9 +94,9 @@ def camera_problem(
     problem = RigProblem(
         templates=templates_of(models, layout),
         corners=vision_data(layout, cameras, weights=weights, views=views),
-        geometry=geometry_of(target),
+        geometry=geometry_of(target) if offset_sigma_m is None else geometry_of(target, offset_sigma_m),
         imu=None,
-        prior=no_prior(layout),
+        prior=lens_prior(models, layout),
         free_chain=jnp.asarray(free_chain),
         free=jnp.asarray(free),
         loss_width=jnp.asarray(float(loss_width)),
@@ -92,7 +113,7 @@ def camera_problem(
         rotations=jnp.asarray(rotations),
         positions=jnp.asarray(positions),
         biases=jnp.zeros((len(positions), 0)),
-        target=flat_target(layout) if target_state is None else target_state,
+        target=target_state,
     )
     return problem, state
 

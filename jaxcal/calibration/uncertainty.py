@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.calibration.state import RigState, SharedLayout, tangent_basis
+from jaxcal.cameras import CameraModel
 from jaxcal.estimation import BlockArrow, factorise, single_threaded_blas
 
 # Eigenvalues of the information matrix, scaled to unit diagonal, below which a direction counts as unobserved.
@@ -28,15 +29,29 @@ def shared_covariance(
     and sentences about directions that the data leave open."""
     with single_threaded_blas():
         schur, chain = (np.asarray(part) for part in _schur(equations))
-    information = schur[np.ix_(free, free)]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])
+    values, vectors, scale = _scaled_eigen(schur, free)
     weak = values < _UNOBSERVED
     sentences = [_unobserved_sentence(vectors[:, k], np.asarray(labels)[free]) for k in np.flatnonzero(weak)]
     inverse = (vectors / np.maximum(values, _UNOBSERVED)) @ vectors.T
     covariance = np.zeros(schur.shape)
     covariance[np.ix_(free, free)] = inverse * scale[:, None] * scale[None, :]
     return covariance, chain, sentences
+
+
+def shared_information(equations: BlockArrow, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (F, F), as columns, that do not correlate, and how well each is known: 1 / variance along it (F,)."""
+    with single_threaded_blas():
+        schur = np.asarray(_schur(equations)[0])
+    values, vectors, scale = _scaled_eigen(schur, free)
+    return values, scale[:, None] * vectors
+
+
+def _scaled_eigen(schur: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Eigenvalues and vectors of the information scaled to unit diagonal, and that scale."""
+    information = schur[np.ix_(free, free)]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])
+    return values, vectors, scale
 
 
 def _unobserved_sentence(direction: np.ndarray, labels: np.ndarray) -> str:
@@ -48,16 +63,17 @@ def _unobserved_sentence(direction: np.ndarray, labels: np.ndarray) -> str:
     )
 
 
-def labels_of(names: Sequence[str], layout: SharedLayout, num_intrinsics: Sequence[int]) -> list[str]:
+def labels_of(names: Sequence[str], models: Sequence[CameraModel], layout: SharedLayout) -> list[str]:
     """A name for every coordinate of the shared tangent vector."""
     labels: list[str] = []
-    for c, name in enumerate(names):
-        size = layout.sizes[c]
-        known = ["fx", "fy", "cx", "cy"] if num_intrinsics[c] == 4 else [f"p{i}" for i in range(num_intrinsics[c])]
-        lens = known + [f"distortion[{i}]" for i in range(size - num_intrinsics[c])]
-        pose = [f"rotation {a}" for a in "xyz"] + [f"translation {a}" for a in "xyz"]
+    pose = [f"rotation {a}" for a in "xyz"] + [f"translation {a}" for a in "xyz"]
+    for name, model in zip(names, models, strict=True):
+        lens = [label for part in model.parameter_names for label in part]
         labels += [f"{name} {label}" for label in [*lens, *pose, "time shift"]]
-    return [*labels, "gravity direction 1", "gravity direction 2"]
+    labels += ["gravity direction 1", "gravity direction 2"]
+    labels += [f"board {b + 1} {label}" for b in range(layout.extra_boards) for label in pose]
+    labels += ["board warp x", "board warp y"] if layout.warp else []
+    return labels + [f"point {i} offset {a}" for i in range(layout.offsets) for a in "xyz"]
 
 
 def _hat(v: np.ndarray) -> np.ndarray:
@@ -70,7 +86,9 @@ def named_covariance(
     state: RigState,
     covariance: np.ndarray,
     num_intrinsics: Sequence[int],
+    *,
     with_imu: bool,
+    with_time: bool,
 ) -> tuple[tuple[tuple[str, int], ...], np.ndarray]:
     """Blocks and joint covariance of the parameters as `Calibration` names them, by linear propagation."""
     blocks: list[tuple[str, int]] = []
@@ -93,10 +111,21 @@ def named_covariance(
         if with_imu:
             blocks.append((f"{name}.T_cam_imu", 6))
             rows.append(identity[layout.pose(c)])
-            blocks.append((f"{name}.timeshift_cam_imu", 1))
+        if with_time and (with_imu or c > 0):
+            blocks.append((f"{name}.timeshift_cam_{'imu' if with_imu else 'cam0'}", 1))
             rows.append(identity[[layout.shift(c)]])
     if with_imu:
         blocks.append(("gravity", 3))
         rows.append(np.asarray(tangent_basis(state.gravity)) @ identity[layout.gravity])
+    start = layout.target.start
+    for b in range(layout.extra_boards):
+        blocks.append((f"target.T_target_board{b + 1}", 6))
+        rows.append(identity[start + 6 * b : start + 6 * (b + 1)])
+    start += 6 * layout.extra_boards
+    for name, size in (("warp", 2 * layout.warp), ("offsets", 3 * layout.offsets)):
+        if size:
+            blocks.append((f"target.{name}", size))
+            rows.append(identity[start : start + size])
+            start += size
     jacobian = np.concatenate(rows)
     return tuple(blocks), jacobian @ covariance @ jacobian.T

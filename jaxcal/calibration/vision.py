@@ -129,6 +129,14 @@ def _camera_poses(state: RigState, data: VisionData, poses: FramePoses) -> tuple
     return rotation, translation
 
 
+def frame_transforms(state: RigState, data: VisionData, poses: FramePoses) -> Float[Array, "F 4 4"]:
+    """T_cam_target of each frame."""
+    rotation, translation = _camera_poses(state, data, poses)
+    upper = jnp.concatenate([rotation, translation[..., None]], axis=-1)
+    last = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]), (len(upper), 1, 4))
+    return jnp.concatenate([upper, last], axis=1)
+
+
 def linearise_frames(
     template: CameraModel,
     state: RigState,
@@ -164,6 +172,31 @@ def linearise_frames(
     (shared, gradient_shared, cost), chain = jax.lax.scan(batch, start, (camera, R_cam_rig, batches))
     window, cross, gradient_window = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in chain)
     return FrameEquations(window, cross, gradient_window, shared, gradient_shared, cost)
+
+
+def equations_of_each_frame(
+    template: CameraModel,
+    state: RigState,
+    data: VisionData,
+    poses: FramePoses,
+    group: int,
+    points: Float[Array, "3 N"],
+    by_target: Float[Array, "T 3 N"],
+    loss: Callable[[Array], tuple[Array, Array]],
+) -> tuple[Float[Array, "F q q"], Float[Array, "F 6 q"], Float[Array, "F 6 6"]]:
+    """What each frame with a pose of its own adds to the Hessian: shared coordinates, pose times shared, pose."""
+    rotation, translation = _camera_poses(state, data, poses)
+
+    def one(parts: tuple) -> tuple[Array, Array, Array]:
+        lens, R_cam_rig, pose, R_cam_target, t_cam_target, pixels, weight = parts
+        gram, _ = _reduce_corners(template, lens, points, by_target, loss, R_cam_target, t_cam_target, pixels, weight)
+        (window, cross, _), turned = _lift(gram, pose, R_cam_target, R_cam_rig)
+        shared, _ = _shared_equations(gram, turned, lens.shape[0])
+        return shared, cross[0], window[0, :, 0]
+
+    lenses, R_cam_rig = state.lenses[group][data.camera], state.R_cam_rig[data.rig_camera]
+    frames = (lenses, R_cam_rig, poses, rotation, translation, data.pixels, data.weight)
+    return jax.lax.map(one, frames, batch_size=FRAME_BATCH)
 
 
 def _reduce_corners(

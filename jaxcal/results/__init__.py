@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
+from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration, TargetShape
 from jaxcal.results.files import load_calibration, save_calibration
 from jaxcal.results.kalibr import CamchainCamera, load_camchain
 from jaxcal.results.text import results_text
@@ -16,6 +16,7 @@ __all__ = [
     "CamchainCamera",
     "CameraCalibration",
     "ImuCalibration",
+    "TargetShape",
     "Verdict",
     "judge",
     "load_calibration",

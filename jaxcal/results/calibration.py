@@ -14,6 +14,35 @@ from jaxcal.targets import Target
 
 
 @dataclass(frozen=True)
+class TargetShape:
+    """What was found of the target itself.
+
+    `T_target_board` (B, 4, 4) maps points of each board into the target's frame, that of the first board; `warp_m`
+    (2,) the bend along columns and rows: a point is raised out of the board by w_x (1 - x^2) + w_y (1 - y^2), x and y
+    from -1 to 1 across the board's points; `offsets_m` (N, 3) of the points from their stated places, in the board's
+    frame. None where the target was taken as stated.
+    """
+
+    T_target_board: np.ndarray
+    warp_m: np.ndarray | None = None
+    offsets_m: np.ndarray | None = None
+
+    def points(self, target: Target) -> np.ndarray:
+        """Points (N, 3) of the target as it was found to be, m, in the target's frame."""
+        points, board = target.points.copy(), target.board_of_point
+        if self.warp_m is not None:
+            for b in range(len(self.T_target_board)):
+                plane = points[board == b, :2]
+                low, high = plane.min(axis=0), plane.max(axis=0)
+                across = (2.0 * plane - low - high) / np.maximum(high - low, 1e-12)
+                points[board == b, 2] += (1.0 - across**2) @ self.warp_m
+        if self.offsets_m is not None:
+            points = points + self.offsets_m
+        placed = self.T_target_board[board]
+        return np.einsum("nij,nj->ni", placed[:, :3, :3], points) + placed[:, :3, 3]
+
+
+@dataclass(frozen=True)
 class CameraCalibration:
     """One calibrated camera.
 
@@ -22,6 +51,9 @@ class CameraCalibration:
     measurement for each corner of `detections`, NaN where the corner took no part (frame outside the IMU's time,
     say); `inlier` (M,) is False for corners that were rejected. `corner_sigma_px` is the noise of one corner
     coordinate, estimated from the residuals; `reprojection_rms_px` the root mean square 2-D error of the inliers.
+    `T_cam_target` (T, 4, 4) is the target's pose in the camera's frame for each of the detections' timestamps, NaN
+    where it was not estimated. `timeshift_cam_cam0` (s, t_cam0 = t_cam + shift) where cameras without an IMU were
+    calibrated with a time offset each.
     """
 
     name: str
@@ -34,6 +66,8 @@ class CameraCalibration:
     residuals_px: np.ndarray
     inlier: np.ndarray
     corner_sigma_px: float
+    T_cam_target: np.ndarray | None = None
+    timeshift_cam_cam0: float | None = None
 
     @property
     def used(self) -> np.ndarray:
@@ -84,7 +118,9 @@ class Calibration:
     `blocks` names the rows of `covariance` (P, P), in order, with their sizes: 'cam0.intrinsics',
     'cam0.distortion', 'cam1.T_cn_cnm1' (rotation x y z in rad, then translation x y z in m, both as a perturbation on
     the left: R = Exp(dr) R0, t = t0 + dt, in the frame of the camera), 'cam0.T_cam_imu' likewise,
-    'cam0.timeshift_cam_imu' (s), 'gravity' (m/s^2, target frame). Held parameters have zero variance.
+    'cam0.timeshift_cam_imu' (s), 'cam1.timeshift_cam_cam0' (s), 'gravity' (m/s^2, target frame),
+    'target.T_target_board1' (as the other poses), 'target.warp' (m), 'target.offsets' (m, x y z of each point). Held
+    parameters have zero variance.
 
     `gravity` (3,) is the acceleration of free fall in the target frame (it points down), None without an IMU.
     `convergence` is the cost after each iteration of the last solve, `converged` whether that solve reached its
@@ -102,6 +138,12 @@ class Calibration:
     settings: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     converged: bool = True
+    target_shape: TargetShape | None = None
+
+    @property
+    def target_points(self) -> np.ndarray:
+        """Points (N, 3) of the target, m, as they were found to be where that was estimated."""
+        return self.target.points if self.target_shape is None else self.target_shape.points(self.target)
 
     def _slice(self, name: str) -> slice:
         start = 0

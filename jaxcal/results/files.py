@@ -7,12 +7,14 @@ A folder holds, each written atomically:
 - `results.txt`: for people (`jaxcal.results.text`);
 - `calibration.npz`: everything, without loss; the only one that `load_calibration` reads.
 
-`calibration.npz`, version 1, holds no pickles. `meta` is the UTF-8 of a JSON object (as uint8): `format`, `version`,
+`calibration.npz`, version 2, holds no pickles. `meta` is the UTF-8 of a JSON object (as uint8): `format`, `version`,
 `cameras` (per camera `name`, `model`, `image_size`, `timeshift_cam_imu`, `corner_sigma_px`), `target` (as in Kalibr's
 `target.yaml`), `blocks`, `converged`, `warnings`, `settings`, `versions`, and `imu` (the scalars of `ImuCalibration`)
 or null. The arrays are `covariance`, `convergence`, `gravity`; for camera k `cam<k>.parameters`, `.T_cn_cnm1`,
 `.T_cam_imu`, `.residuals_px`, `.inlier` and `.detections.timestamps_ns`, `.frame`, `.point`, `.pixels`,
-`.image_size`; and `imu.<field>` for every array of `ImuCalibration`. What is None is absent.
+`.image_size`; and `imu.<field>` for every array of `ImuCalibration`. What is None is absent. Version 2 added
+`cam<k>.T_cam_target`, `timeshift_cam_cam0` (in `meta`) and `target_shape.T_target_board`, `.warp_m`, `.offsets_m`;
+version 1 is read as well.
 """
 
 import dataclasses
@@ -29,14 +31,15 @@ from jaxcal.atomic import write_bytes, write_text
 from jaxcal.cameras import camera_model, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import Detections
-from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
+from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration, TargetShape
 from jaxcal.results.kalibr import camchain, imu_entry, to_yaml
 from jaxcal.results.text import results_text
 from jaxcal.targets import target_from_yaml
 
 FILE_NAME = "calibration.npz"
 _FORMAT = "jaxcal-calibration"
-_VERSION = 1
+_VERSION = 2
+_READABLE = (1, 2)
 _DETECTION_ARRAYS = ("timestamps_ns", "frame", "point", "pixels")
 _IMU_SCALARS = ("origin_ns", "gyro_sigma", "accel_sigma", "noise", "knot_rate_hz", "spline_order")
 
@@ -86,6 +89,9 @@ def _arrays(calibration: Calibration) -> dict[str, np.ndarray]:
     }
     for k, camera in enumerate(calibration.cameras):
         arrays |= {f"cam{k}.{name}": value for name, value in _camera_arrays(camera).items()}
+    if calibration.target_shape is not None:
+        shape = calibration.target_shape
+        arrays |= {f"target_shape.{field.name}": getattr(shape, field.name) for field in dataclasses.fields(shape)}
     if calibration.imu is not None:
         arrays |= {f"imu.{name}": getattr(calibration.imu, name) for name in _imu_arrays()}
     text = json.dumps(_meta(calibration), default=_plain)
@@ -104,6 +110,7 @@ def _camera_arrays(camera: CameraCalibration) -> dict[str, np.ndarray | None]:
         "T_cam_imu": camera.T_cam_imu,
         "residuals_px": camera.residuals_px,
         "inlier": camera.inlier,
+        "T_cam_target": camera.T_cam_target,
         **{f"detections.{name}": getattr(detections, name) for name in _DETECTION_ARRAYS},
         "detections.image_size": np.array(detections.image_size),
     }
@@ -120,6 +127,7 @@ def _meta(calibration: Calibration) -> dict[str, Any]:
                 "model": model_name(camera.model),
                 "image_size": list(camera.image_size),
                 "timeshift_cam_imu": camera.timeshift_cam_imu,
+                "timeshift_cam_cam0": camera.timeshift_cam_cam0,
                 "corner_sigma_px": camera.corner_sigma_px,
             }
             for camera in calibration.cameras
@@ -189,10 +197,11 @@ def _read_meta(file: Path, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
         raise CalibrationError(f"{file}: `meta` is damaged ({error}). Calibrate and save again.") from error
     if kind != _FORMAT:
         raise CalibrationError(f"{file}: format is {kind!r}; expected {_FORMAT!r}. This is another kind of file.")
-    if version != _VERSION:
+    if version not in _READABLE:
         remedy = "upgrade jaxcal" if isinstance(version, int) and version > _VERSION else "calibrate and save again"
         raise CalibrationError(
-            f"{file}: written in version {version!r} of the format; this jaxcal reads version {_VERSION}: {remedy}."
+            f"{file}: written in version {version!r} of the format; this jaxcal reads versions 1 to "
+            f"{_VERSION}: {remedy}."
         )
     return meta
 
@@ -213,7 +222,13 @@ def _decode(meta: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         settings=meta["settings"],
         versions=meta["versions"],
         converged=meta["converged"],
+        target_shape=_decode_shape(arrays),
     )
+
+
+def _decode_shape(arrays: dict[str, np.ndarray]) -> TargetShape | None:
+    mine = {name.partition(".")[2]: value for name, value in arrays.items() if name.startswith("target_shape.")}
+    return TargetShape(**mine) if mine else None
 
 
 def _decode_camera(entry: dict[str, Any], index: int, arrays: dict[str, np.ndarray]) -> CameraCalibration:
@@ -240,4 +255,6 @@ def _decode_camera(entry: dict[str, Any], index: int, arrays: dict[str, np.ndarr
         residuals_px=mine["residuals_px"],
         inlier=mine["inlier"],
         corner_sigma_px=entry["corner_sigma_px"],
+        T_cam_target=mine.get("T_cam_target"),
+        timeshift_cam_cam0=entry.get("timeshift_cam_cam0"),
     )

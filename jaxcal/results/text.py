@@ -78,10 +78,37 @@ def _cameras(calibration: Calibration) -> str:
             f"    corners: {int(camera.used.sum())} used of {len(camera.detections)}, "
             f"in {len(camera.detections.seen_frames)} frames",
         ]
+        if camera.timeshift_cam_cam0 is not None:
+            sigma = sigma_of(calibration, f"{camera.name}.timeshift_cam_cam0")
+            shown = "held" if sigma is None else format(sigma[0], ".3g")
+            lines.append(
+                f"    timeshift to {calibration.cameras[0].name}: {camera.timeshift_cam_cam0!r} +- {shown} [s]"
+            )
     for k, camera in enumerate(calibration.cameras):
         if camera.T_cn_cnm1 is not None:
             lines += _baseline(calibration, k, camera.T_cn_cnm1)
-    return "\n".join(lines)
+    return "\n".join([*lines, *_target_shape(calibration)])
+
+
+def _target_shape(calibration: Calibration) -> list[str]:
+    shape = calibration.target_shape
+    if shape is None:
+        return []
+    lines = ["target, as found:"]
+    for b in range(1, len(shape.T_target_board)):
+        sigma = sigma_of(calibration, f"target.T_target_board{b}")
+        shift = None if sigma is None else sigma[3:]
+        vector = Rotation.from_matrix(shape.T_target_board[b, :3, :3]).as_rotvec()
+        lines += [
+            f"    board {b} in the frame of board 0: t: {_with_sigma(shape.T_target_board[b, :3, 3], shift)} [m]",
+            f"        rotation vector: {_with_sigma(vector, None if sigma is None else sigma[:3])} [rad]",
+        ]
+    if shape.warp_m is not None:
+        lines.append(f"    warp: {_with_sigma(shape.warp_m, sigma_of(calibration, 'target.warp'))} [m]")
+    if shape.offsets_m is not None:
+        rms, most = np.sqrt(np.mean(shape.offsets_m**2, axis=0)), np.abs(shape.offsets_m).max(axis=0)
+        lines.append(f"    points off their place: rms {_numbers(rms)}, at most {_numbers(most)} [m]")
+    return lines
 
 
 def _baseline(calibration: Calibration, index: int, transform: np.ndarray) -> list[str]:
