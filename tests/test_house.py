@@ -55,6 +55,8 @@ ALLOWED: dict[str, set[str]] = {
         "reconstruction",
     }
     | OBSERVATIONS,
+    # The command may use every room.
+    "jaxcal.cli": {"jaxcal", "reconstruction"},
     "reconstruction": OBSERVATIONS,
     "reconstruction.training": {"jaxcal.simulation.event_sensor", "reconstruction"} | OBSERVATIONS,
 }
@@ -178,8 +180,8 @@ def test_library_modules_never_print_and_never_exit() -> None:
     calls = [
         f"{path.relative_to(ROOT)}:{node.lineno}: {ast.unparse(node.func)}"
         for path in library_files()
-        # `python -m reconstruction.training` is a command, and so is the `jaxcal` command.
-        if path.name not in ("__main__.py", "cli.py")
+        # `python -m reconstruction.training` is a command.
+        if path.name != "__main__.py"
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Call) and ast.unparse(node.func) in forbidden
     ]

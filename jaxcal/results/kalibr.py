@@ -15,17 +15,6 @@ from jaxcal.cameras import CameraModel, camera_model, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
 
-# (camera_model, distortion_model) pairs that Kalibr knows; other models are written as 'module:Class'.
-_KALIBR_MODELS = {
-    ("pinhole", "radtan"),
-    ("pinhole", "equi"),
-    ("pinhole", "fov"),
-    ("pinhole", "none"),
-    ("omni", "radtan"),
-    ("omni", "none"),
-    ("eucm", "none"),
-    ("ds", "none"),
-}
 _OWN_DISTORTION = "custom"  # stands where the distortion is part of a 'module:Class' model
 _CAMERA_KEYS = (
     "T_cam_imu",
@@ -59,6 +48,19 @@ def camchain(calibration: Calibration) -> dict[str, Any]:
     """The content of `camchain.yaml` (without an IMU) or `camchain-imucam.yaml`: 'cam0' .. 'camN' to their entries."""
     overlaps = camera_overlaps(calibration.cameras)
     return {f"cam{k}": _camera_entry(camera, overlaps[k]) for k, camera in enumerate(calibration.cameras)}
+
+
+def model_entry(model: CameraModel) -> dict[str, Any]:
+    """A lens in a camchain: 'pinhole' and 'radtan', say, by Kalibr's names where it has them, or 'module:Class'."""
+    projection, _, distortion = model_name(model).partition("-")
+    if ":" in model_name(model):  # may have hyphens in its own name
+        projection, distortion = model_name(model), _OWN_DISTORTION
+    return {
+        "camera_model": projection,
+        "distortion_coeffs": np.asarray(model.distortion).tolist(),
+        "distortion_model": distortion,
+        "intrinsics": np.asarray(model.intrinsics).tolist(),
+    }
 
 
 def imu_entry(imu: ImuCalibration) -> dict[str, Any]:
@@ -127,13 +129,9 @@ def load_camchain(path: str | Path) -> tuple[CamchainCamera, ...]:
 
 
 def _camera_entry(camera: CameraCalibration, overlaps: list[int]) -> dict[str, Any]:
-    projection, distortion = _kalibr_model(camera.model)
     entry: dict[str, Any] = {
         "cam_overlaps": overlaps,
-        "camera_model": projection,
-        "distortion_coeffs": np.asarray(camera.model.distortion).tolist(),
-        "distortion_model": distortion,
-        "intrinsics": np.asarray(camera.model.intrinsics).tolist(),
+        **model_entry(camera.model),
         "resolution": [int(size) for size in camera.image_size],
         "rostopic": f"/{camera.name}/image_raw",
     }
@@ -144,13 +142,6 @@ def _camera_entry(camera: CameraCalibration, overlaps: list[int]) -> dict[str, A
     if camera.timeshift_cam_imu is not None:
         entry["timeshift_cam_imu"] = float(camera.timeshift_cam_imu)
     return entry
-
-
-def _kalibr_model(model: CameraModel) -> tuple[str, str]:
-    projection, _, distortion = model_name(model).partition("-")
-    if (projection, distortion) in _KALIBR_MODELS:
-        return projection, distortion
-    return f"{type(model).__module__}:{type(model).__qualname__}", _OWN_DISTORTION
 
 
 def _see_together(a: CameraCalibration, b: CameraCalibration) -> bool:
