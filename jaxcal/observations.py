@@ -222,10 +222,11 @@ class Detections:
 
     `timestamps_ns` (F,) int64, strictly increasing, one per frame (frames without corners may be listed); for each of
     M corners: `frame` (M,) index into `timestamps_ns`, `point` (M,) index into `target.points`, `pixels` (M, 2) with
-    the centre of the top-left pixel at (0, 0); `image_size` (width, height).
+    the centre of the top-left pixel at (0, 0); `image_size` (width, height). `precision` (M,), for detectors that know
+    some corners better than others, is proportional to 1 / sigma of each; None where all are alike.
 
-    Raises CalibrationError when shapes differ, an index is out of range, a point appears twice in a frame or a
-    coordinate is not finite.
+    Raises CalibrationError when shapes differ, an index is out of range, a point appears twice in a frame, a
+    coordinate is not finite or a precision not positive.
     """
 
     timestamps_ns: np.ndarray
@@ -233,6 +234,7 @@ class Detections:
     point: np.ndarray
     pixels: np.ndarray
     image_size: tuple[int, int]
+    precision: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         times = np.asarray(self.timestamps_ns)
@@ -272,6 +274,14 @@ class Detections:
         object.__setattr__(self, "frame", frame)
         object.__setattr__(self, "point", point)
         object.__setattr__(self, "pixels", pixels)
+        if self.precision is not None:
+            precision = np.asarray(self.precision, dtype=np.float64)
+            _require(precision.shape == (m,), f"Detections: precision has shape {precision.shape}; expected {(m,)}.")
+            _require(
+                bool(np.all(np.isfinite(precision) & (precision > 0))),
+                "Detections: `precision` must be positive; leave corners out that are worth nothing.",
+            )
+            object.__setattr__(self, "precision", precision[order])
         width, height = self.image_size
         _require(width > 0 and height > 0, f"Detections: image_size is {self.image_size}; expected (width, height).")
         object.__setattr__(self, "image_size", (int(width), int(height)))
@@ -295,6 +305,7 @@ class Detections:
             point=self.point,
             pixels=self.pixels,
             image_size=np.array(self.image_size),
+            **({} if self.precision is None else {"precision": self.precision}),
         )
         write_bytes(Path(path), content.getvalue())
 
@@ -308,6 +319,7 @@ class Detections:
             # Opened here, because numpy leaves a file open that turns out to be damaged.
             with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
                 fields = {name: data[name] for name in ("timestamps_ns", "frame", "point", "pixels")}
+                fields["precision"] = data.get("precision")
                 width, height = (int(value) for value in data["image_size"])
         except Exception as error:
             raise CalibrationError(

@@ -35,6 +35,14 @@ class CameraFrames:
             self.detections, self.frames[index], self.time_ns[index], self.pixels[index], self.seen[index]
         )
 
+    @property
+    def precision(self) -> np.ndarray:
+        """Relative 1 / sigma (F, N) of the corners, 1 where the detector does not tell."""
+        dense = np.ones((len(self.detections.timestamps_ns), self.seen.shape[1]))
+        if self.detections.precision is not None:
+            dense[self.detections.frame, self.detections.point] = self.detections.precision
+        return dense[self.frames]
+
     def per_corner(self, dense: np.ndarray, fill: float | bool) -> np.ndarray:
         """Values (F, N, ...) at the frames that take part, as one row per corner of the detections."""
         out = np.full((len(self.detections), *dense.shape[2:]), fill, dtype=dense.dtype)

@@ -76,6 +76,7 @@ def robust_fit(
     layout = problem.layout
     seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]
     kept, sigmas = seen, list(first_sigmas)
+    precision = [frames.precision for frames in cameras]
     redundancy = [Redundancy(np.ones(len(s)), 1.0, 0.0) for s in seen]
     result: SolveResult | None = None
     errors: list[np.ndarray] = []
@@ -88,23 +89,25 @@ def robust_fit(
         result = solve(problem, state, max_steps=max_steps)
         state = result.state
         errors = split_groups(layout, cameras, [np.asarray(e) for e in corner_errors(problem, state)])
+        # In units of an ordinary corner: what a detector knows to be vague may err more.
+        scaled = [e * p[..., None] for e, p in zip(errors, precision, strict=True)]
         if not np.isfinite(float(result.equations.cost)):
             raise CalibrationError(
                 "the optimisation diverged: the residuals are not finite. Check for frames with a wrong board, and "
                 "that the camera models suit the lenses."
             )
         if stage < 3:
-            sigmas = [outliers.robust_sigma(e, s) for e, s in zip(errors, kept, strict=True)]
+            sigmas = [outliers.robust_sigma(e, s) for e, s in zip(scaled, kept, strict=True)]
         if stage == 1:
-            redundancy = [measure_redundancy(*parts) for parts in zip(cameras, errors, seen, sigmas, strict=True)]
+            redundancy = [measure_redundancy(*parts) for parts in zip(cameras, scaled, seen, sigmas, strict=True)]
         if stage == 2:
-            kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(errors, seen, sigmas, strict=True)]
+            kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(scaled, seen, sigmas, strict=True)]
         if stage >= 3:
             parameters = [n + p for n, p in zip(layout.sizes, pose_parameters, strict=True)]
-            sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(errors, kept, parameters, strict=True)]
+            sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(scaled, kept, parameters, strict=True)]
         if stage == 3:
             # Good corners that outliers in the same view had pulled away are taken back.
-            kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(errors, seen, sigmas, strict=True)]
+            kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(scaled, seen, sigmas, strict=True)]
         logger.info(
             "round %d: cost %.6g after %d iterations, corner noise %s px",
             stage,
@@ -125,7 +128,10 @@ def _with_weights(
     redundancy: Sequence[Redundancy],
     loss_width: float,
 ) -> RigProblem:
-    weights = [k * r.weights[:, None] / sigma**2 for k, sigma, r in zip(kept, sigmas, redundancy, strict=True)]
+    weights = [
+        k * r.weights[:, None] * (frames.precision / sigma) ** 2
+        for k, sigma, r, frames in zip(kept, sigmas, redundancy, cameras, strict=True)
+    ]
     return eqx.tree_at(
         lambda p: [*[data.weight for data in p.corners], p.loss_width],
         problem,

@@ -13,8 +13,8 @@ A folder holds, each written atomically:
 or null. The arrays are `covariance`, `convergence`, `gravity`; for camera k `cam<k>.parameters`, `.T_cn_cnm1`,
 `.T_cam_imu`, `.residuals_px`, `.inlier` and `.detections.timestamps_ns`, `.frame`, `.point`, `.pixels`,
 `.image_size`; and `imu.<field>` for every array of `ImuCalibration`. What is None is absent. Version 2 added
-`cam<k>.T_cam_target`, `timeshift_cam_cam0` (in `meta`) and `target_shape.T_target_board`, `.warp_m`, `.offsets_m`;
-version 1 is read as well.
+`cam<k>.T_cam_target` and `.detections.precision`, `timeshift_cam_cam0` (in `meta`), and `target_shape.T_target_board`,
+`.warp_m`, `.offsets_m`; version 1 is read as well.
 """
 
 import dataclasses
@@ -113,6 +113,7 @@ def _camera_arrays(camera: CameraCalibration) -> dict[str, np.ndarray | None]:
         "T_cam_target": camera.T_cam_target,
         **{f"detections.{name}": getattr(detections, name) for name in _DETECTION_ARRAYS},
         "detections.image_size": np.array(detections.image_size),
+        "detections.precision": detections.precision,
     }
 
 
@@ -251,6 +252,7 @@ def _decode_camera(entry: dict[str, Any], index: int, arrays: dict[str, np.ndarr
         detections=Detections(
             **{name: mine[f"detections.{name}"] for name in _DETECTION_ARRAYS},
             image_size=(seen_width, seen_height),
+            precision=mine.get("detections.precision"),
         ),
         residuals_px=mine["residuals_px"],
         inlier=mine["inlier"],
