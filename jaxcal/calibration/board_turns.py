@@ -161,5 +161,5 @@ def _renumbered(frames: CameraFrames, turned: np.ndarray, target: Target) -> Cam
     row_of[frames.frames] = np.arange(len(frames.frames))
     place = row_of[old.frame]
     point = np.where(place >= 0, number[place, old.point], old.point)
-    detections = Detections(old.timestamps_ns, old.frame, point, old.pixels, old.image_size)
+    detections = Detections(old.timestamps_ns, old.frame, point, old.pixels, old.image_size, old.precision)
     return CameraFrames(detections, frames.frames, frames.time_ns, pixels, seen)

@@ -7,6 +7,8 @@ import numpy as np
 
 from jaxcal.calibration import rig_graph, selection, solving
 from jaxcal.calibration.assemble import CameraFrames, camera_frames
+from jaxcal.calibration.board_checks import check_board
+from jaxcal.calibration.board_turns import symmetry_sentences, unify_turns
 from jaxcal.calibration.checks import resolve_models, resolve_names
 from jaxcal.calibration.initial_lens import board_poses, initial_lens
 from jaxcal.calibration.outcome import calibration_from, chain_covariance_and_sentences
@@ -15,7 +17,7 @@ from jaxcal.calibration.restart import confirm_optimum
 from jaxcal.calibration.rig_graph import RigGraph, Sightings
 from jaxcal.calibration.robust import robust_fit
 from jaxcal.calibration.state import SharedLayout, layout_of
-from jaxcal.calibration.views import BoardFrames, associate, split_boards
+from jaxcal.calibration.views import associate, split_boards
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.estimation import LOSSES, Loss
@@ -100,7 +102,7 @@ def calibrate_cameras(
         target,
         covariance=covariance,
         imu=None,
-        warnings=[*restart, *sentences],
+        warnings=[*start.sentences, *restart, *sentences],
         settings=settings,
         with_time=False,
     )
@@ -108,13 +110,14 @@ def calibrate_cameras(
 
 @dataclass(frozen=True)
 class _Start:
-    """What is known before the joint solve: frames, their views (V of them), first lenses and poses."""
+    """What is known before the joint solve: frames, their views (V of them), first lenses and poses; and sentences."""
 
     lenses: list[CameraModel]
     cameras: list[CameraFrames]
     views: list[np.ndarray]
     graph: RigGraph
     T_target_rig: Poses
+    sentences: list[str]
 
 
 def _start(
@@ -125,18 +128,24 @@ def _start(
     tolerance_ns: int,
     progress: Progress,
 ) -> _Start:
+    sentences = [s for name, frames in zip(names, cameras, strict=True) for s in check_board(name, frames, target)]
     boards = [split_boards(frames, target) for frames in cameras]
     work = list(zip(names, classes, boards, strict=True))
     lenses = [initial_lens(n, m, b.frames, target) for n, m, b in track(work, "initial lenses", len(work), progress)]
     views, times = associate(cameras, tolerance_ns)
-    sightings = [_sightings(*parts, target) for parts in zip(lenses, boards, views, strict=True)]
+    found = [board_poses(lens, b.frames, target) for lens, b in zip(lenses, boards, strict=True)]
+    poses = [(rotation, translation) for rotation, translation, _ in found]
+    if len(target.turns) > 1:
+        unified = unify_turns(names, cameras, views, poses, target)
+        cameras, poses = unified.cameras, unified.poses
+        sentences += [*symmetry_sentences(target, len(names)), *unified.sentences]
+    sightings = [
+        Sightings(view[b.row], b.board, pose, error)
+        for view, b, pose, (*_, error) in zip(views, boards, poses, found, strict=True)
+    ]
     graph = rig_graph.solve_graph(names, sightings, len(target.boards), tolerance_ns)
-    return _Start(lenses, list(cameras), views, graph, rig_graph.rig_poses(graph, sightings, len(times)))
-
-
-def _sightings(lens: CameraModel, boards: BoardFrames, view: np.ndarray, target: Target) -> Sightings:
-    rotation, translation, error = board_poses(lens, boards.frames, target)
-    return Sightings(view[boards.row], boards.board, (rotation, translation), error)
+    T_target_rig = rig_graph.rig_poses(graph, sightings, len(times))
+    return _Start(lenses, list(cameras), views, graph, T_target_rig, sentences)
 
 
 def _problem(start: _Start, target: Target, layout: SharedLayout, offset_sigma_m: float | None, loss: Loss):
@@ -172,6 +181,7 @@ def _select(start: _Start, target: Target, layout: SharedLayout, count: int) -> 
         [number[view[k]] for view, k in zip(start.views, kept, strict=True)],
         start.graph,
         (start.T_target_rig[0][chosen], start.T_target_rig[1][chosen]),
+        start.sentences,
     )
 
 

@@ -101,7 +101,7 @@ def test_cameras_that_nothing_ties_are_named_with_the_recording_that_would() -> 
     truth = rig(np.random.default_rng(0), cameras=3, boards=1, views=20)
     views = [np.arange(0, 10), np.arange(5, 12), np.arange(12, 20)]
     sightings = [sighted(truth, c, view, np.zeros(len(view), dtype=int)) for c, view in enumerate(views)]
-    with pytest.raises(CalibrationError, match="rear never saw the board at the same time as left, right.*second"):
+    with pytest.raises(CalibrationError, match=r"rear never saw the board at the same time as left, right.*second"):
         solve_graph(["left", "right", "rear"], sightings, 1, TOLERANCE_NS)
 
 
