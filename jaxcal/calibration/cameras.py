@@ -13,11 +13,13 @@ from jaxcal.calibration.checks import resolve_models, resolve_names
 from jaxcal.calibration.initial_lens import board_poses, initial_lens
 from jaxcal.calibration.outcome import calibration_from, chain_covariance_and_sentences
 from jaxcal.calibration.poses import Poses
+from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.restart import confirm_optimum
 from jaxcal.calibration.rig_graph import RigGraph, Sightings
 from jaxcal.calibration.robust import robust_fit
-from jaxcal.calibration.state import SharedLayout, layout_of
-from jaxcal.calibration.views import associate, split_boards
+from jaxcal.calibration.state import RigState, SharedLayout, layout_of
+from jaxcal.calibration.unsynchronised import continuous_problem
+from jaxcal.calibration.views import BoardFrames, associate, split_boards
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.estimation import LOSSES, Loss
@@ -34,6 +36,7 @@ def calibrate_cameras(
     *,
     names: Sequence[str] | None = None,
     sync_tolerance_s: float = 0.002,
+    time_offsets: bool = False,
     views: int | None = None,
     board_warp: bool = False,
     point_offset_sigma_m: float | None = None,
@@ -48,46 +51,50 @@ def calibrate_cameras(
     boards' mutual poses are found. Cameras that never see a board together are tied by the rig's motion where each
     sees a board of its own.
 
+    `time_offsets`: for cameras that are not synchronised (video of a moving rig or board): no frames need coincide; the
+    rig moves on a continuous-time spline and a time offset is estimated for each camera (`timeshift_cam_cam0`).
     `views`: use only that many views, chosen so that they tell most (`selection`). `board_warp` estimates how the
     board is bent (two numbers); `point_offset_sigma_m` lets every point of the target move, under a prior of that
     1-sigma in metres. `loss`: the robust loss under which outliers are found; they are left out of the final least
-    squares. The corner noise of each camera is estimated from its residuals.
+    squares. The corner noise of each camera is estimated from its residuals. The optimum is confirmed by a restart from
+    ten sigmas away.
 
     Raises CalibrationError when a camera has too few views, when no lens explains them, or when nothing connects the
     cameras (it names them, and the recording that would).
     """
     classes = resolve_models(detections, models)
     names = resolve_names(detections, names)
-    if loss not in LOSSES:
-        raise CalibrationError(f"robust loss '{loss}' is unknown; known: {', '.join(LOSSES)}.")
+    _check_options(target, time_offsets, views, loss)
     cameras = [camera_frames(d, target, name) for d, name in zip(detections, names, strict=True)]
-    start = _start(names, classes, cameras, target, round(sync_tolerance_s * 1e9), progress)
+    look = _first_look(names, classes, cameras, target, progress)
     layout = layout_of(
-        start.lenses,
+        look.lenses,
         extra_boards=len(target.boards) - 1,
         warp=board_warp,
         offsets=len(target.points) if point_offset_sigma_m is not None else 0,
     )
-    if views is not None:
-        start = _select(start, target, layout, views)
-    problem, state = _problem(start, target, layout, point_offset_sigma_m, loss)
-    usable = [np.ones(len(frames.frames), dtype=bool) for frames in start.cameras]
+    shape = _Shape(layout, point_offset_sigma_m, loss)
+    if time_offsets:
+        joint = _continuous(names, look, target, shape)
+    else:
+        joint = _synchronous(names, look, target, shape, round(sync_tolerance_s * 1e9), views)
     fit = robust_fit(
-        problem,
-        state,
-        start.cameras,
-        usable,
+        joint.problem,
+        joint.state,
+        joint.cameras,
+        joint.usable,
         first_sigmas=[1.0] * len(cameras),
-        pose_parameters=_pose_parameters(start.views, len(start.T_target_rig[0])),
+        pose_parameters=joint.pose_parameters,
         max_steps=max_steps,
         progress=progress,
     )
-    fit, restart = confirm_optimum(fit, start.cameras, max_steps=max_steps)
-    covariance, _, sentences = chain_covariance_and_sentences(fit, names, start.lenses)
+    fit, restart = confirm_optimum(fit, joint.cameras, max_steps=max_steps)
+    covariance, _, sentences = chain_covariance_and_sentences(fit, names, look.lenses)
     settings = {
         "job": "calibrate_cameras",
         "models": [model_name(cls) for cls in classes],
         "sync_tolerance_s": sync_tolerance_s,
+        "time_offsets": time_offsets,
         "views": views,
         "board_warp": board_warp,
         "point_offset_sigma_m": point_offset_sigma_m,
@@ -97,91 +104,146 @@ def calibrate_cameras(
     return calibration_from(
         fit,
         names,
-        start.cameras,
-        usable,
+        joint.cameras,
+        joint.usable,
         target,
         covariance=covariance,
         imu=None,
-        warnings=[*start.sentences, *restart, *sentences],
+        warnings=[*look.sentences, *joint.sentences, *restart, *sentences],
         settings=settings,
-        with_time=False,
+        with_time=time_offsets,
     )
 
 
+def _check_options(target: Target, time_offsets: bool, views: int | None, loss: str) -> None:
+    if loss not in LOSSES:
+        raise CalibrationError(f"robust loss '{loss}' is unknown; known: {', '.join(LOSSES)}.")
+    if views is not None and views < 3:
+        raise CalibrationError(f"views={views}: a calibration needs 3 views at least; 20 or more make a good one.")
+    if time_offsets and views is not None:
+        raise CalibrationError("time_offsets and views: a trajectory needs all frames. Leave `views` out.")
+    if time_offsets and len(target.boards) > 1:
+        raise CalibrationError(
+            "time_offsets with several boards: not supported. Use one board, or synchronised cameras with all boards."
+        )
+
+
 @dataclass(frozen=True)
-class _Start:
-    """What is known before the joint solve: frames, their views (V of them), first lenses and poses; and sentences."""
+class _Look:
+    """Each camera by itself: first lens, board poses T_cam_board with their errors, px; and sentences."""
 
     lenses: list[CameraModel]
     cameras: list[CameraFrames]
-    views: list[np.ndarray]
-    graph: RigGraph
-    T_target_rig: Poses
+    boards: list[BoardFrames]
+    poses: list[Poses]
+    errors: list[np.ndarray]
     sentences: list[str]
 
 
-def _start(
+@dataclass(frozen=True)
+class _Shape:
+    """What is estimated of the target, and the robust loss."""
+
+    layout: SharedLayout
+    offset_sigma_m: float | None
+    loss: Loss
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """The joint problem with its start; frames that take part; sentences about how the cameras were tied."""
+
+    problem: RigProblem
+    state: RigState
+    cameras: list[CameraFrames]
+    usable: list[np.ndarray]
+    pose_parameters: list[float]
+    sentences: list[str]
+
+
+def _first_look(
     names: Sequence[str],
     classes: Sequence[type[CameraModel]],
     cameras: Sequence[CameraFrames],
     target: Target,
-    tolerance_ns: int,
     progress: Progress,
-) -> _Start:
+) -> _Look:
     sentences = [s for name, frames in zip(names, cameras, strict=True) for s in check_board(name, frames, target)]
     boards = [split_boards(frames, target) for frames in cameras]
     work = list(zip(names, classes, boards, strict=True))
     lenses = [initial_lens(n, m, b.frames, target) for n, m, b in track(work, "initial lenses", len(work), progress)]
-    views, times = associate(cameras, tolerance_ns)
     found = [board_poses(lens, b.frames, target) for lens, b in zip(lenses, boards, strict=True)]
     poses = [(rotation, translation) for rotation, translation, _ in found]
+    return _Look(lenses, list(cameras), boards, poses, [error for *_, error in found], sentences)
+
+
+def _continuous(names: Sequence[str], look: _Look, target: Target, shape: _Shape) -> _Joint:
+    start = continuous_problem(
+        names,
+        look.lenses,
+        look.cameras,
+        look.poses,
+        look.errors,
+        target,
+        shape.layout,
+        offset_sigma_m=shape.offset_sigma_m,
+        loss=shape.loss,
+    )
+    parameters = start.pose_parameters(len(names))
+    return _Joint(start.problem, start.state, look.cameras, start.usable, parameters, [])
+
+
+def _synchronous(
+    names: Sequence[str], look: _Look, target: Target, shape: _Shape, tolerance_ns: int, count: int | None
+) -> _Joint:
+    views, times = associate(look.cameras, tolerance_ns)
+    cameras, poses, sentences = look.cameras, look.poses, []
     if len(target.turns) > 1:
         unified = unify_turns(names, cameras, views, poses, target)
         cameras, poses = unified.cameras, unified.poses
-        sentences += [*symmetry_sentences(target, len(names)), *unified.sentences]
+        sentences = [*symmetry_sentences(target, len(names)), *unified.sentences]
     sightings = [
         Sightings(view[b.row], b.board, pose, error)
-        for view, b, pose, (*_, error) in zip(views, boards, poses, found, strict=True)
+        for view, b, pose, error in zip(views, look.boards, poses, look.errors, strict=True)
     ]
     graph = rig_graph.solve_graph(names, sightings, len(target.boards), tolerance_ns)
     T_target_rig = rig_graph.rig_poses(graph, sightings, len(times))
-    return _Start(lenses, list(cameras), views, graph, T_target_rig, sentences)
+    problem, state = _problem(look.lenses, cameras, views, graph, T_target_rig, target, shape)
+    if count is not None and count < len(times):
+        chosen = selection.most_informative_views(problem, state, count)
+        number = np.full(len(times), -1)
+        number[chosen] = np.arange(len(chosen))
+        kept = [number[view] >= 0 for view in views]
+        cameras = [frames.take(np.flatnonzero(k)) for frames, k in zip(cameras, kept, strict=True)]
+        views = [number[view[k]] for view, k in zip(views, kept, strict=True)]
+        T_target_rig = (T_target_rig[0][chosen], T_target_rig[1][chosen])
+        problem, state = _problem(look.lenses, cameras, views, graph, T_target_rig, target, shape)
+    usable = [np.ones(len(frames.frames), dtype=bool) for frames in cameras]
+    return _Joint(problem, state, cameras, usable, _pose_parameters(views, len(T_target_rig[0])), sentences)
 
 
-def _problem(start: _Start, target: Target, layout: SharedLayout, offset_sigma_m: float | None, loss: Loss):
-    boards = start.graph.T_target_board
+def _problem(
+    lenses: Sequence[CameraModel],
+    cameras: Sequence[CameraFrames],
+    views: Sequence[np.ndarray],
+    graph: RigGraph,
+    T_target_rig: Poses,
+    target: Target,
+    shape: _Shape,
+) -> tuple[RigProblem, RigState]:
     return solving.camera_problem(
-        start.lenses,
-        start.cameras,
+        lenses,
+        cameras,
         target,
-        views=start.views,
-        weights=[np.ones(frames.seen.shape) for frames in start.cameras],
-        T_cam_rig=start.graph.T_cam_rig,
-        T_target_rig=start.T_target_rig,
+        views=views,
+        weights=[np.ones(frames.seen.shape) for frames in cameras],
+        T_cam_rig=graph.T_cam_rig,
+        T_target_rig=T_target_rig,
         loss_width=1.0,
-        layout=layout,
-        boards=(boards[0][1:], boards[1][1:]),
-        offset_sigma_m=offset_sigma_m,
-        loss=loss,
-    )
-
-
-def _select(start: _Start, target: Target, layout: SharedLayout, count: int) -> _Start:
-    """The same start with the `count` views that tell most."""
-    if count < 3:
-        raise CalibrationError(f"views={count}: a calibration needs 3 views at least; 20 or more make a good one.")
-    problem, state = _problem(start, target, layout, 1e-3 if layout.offsets else None, "huber")
-    chosen = selection.most_informative_views(problem, state, count)
-    number = np.full(len(start.T_target_rig[0]), -1)
-    number[chosen] = np.arange(len(chosen))
-    kept = [number[view] >= 0 for view in start.views]
-    return _Start(
-        start.lenses,
-        [frames.take(np.flatnonzero(k)) for frames, k in zip(start.cameras, kept, strict=True)],
-        [number[view[k]] for view, k in zip(start.views, kept, strict=True)],
-        start.graph,
-        (start.T_target_rig[0][chosen], start.T_target_rig[1][chosen]),
-        start.sentences,
+        layout=shape.layout,
+        boards=(graph.T_target_board[0][1:], graph.T_target_board[1][1:]),
+        offset_sigma_m=shape.offset_sigma_m,
+        loss=shape.loss,
     )
 
 

@@ -13,8 +13,8 @@ from jaxcal.trajectory import basis_matrix, increments, rotation_at, weights
 INTERVAL_BATCH = 32
 # Weak priors; orders of magnitude beyond what a hand moves or a MEMS part drifts, so that they only matter where
 # nothing was measured: angular rate, acceleration, biases at switch-on (gyro, accel).
-_RATE_SIGMA = 50.0
-_ACCELERATION_SIGMA = 200.0
+RATE_SIGMA = 50.0
+ACCELERATION_SIGMA = 200.0
 _BIAS_SIGMA = (0.3, 2.0)
 
 
@@ -23,7 +23,7 @@ class InertialData(eqx.Module):
 
     `fraction` (I, S) place in the interval; `readings` (I, S, 6) gyro then accel; `present` (I, S) 1 or 0;
     `inverse_sigma` (6,) of one sample; `walk_sigma` (6,) of the biases over one knot interval; `start`, `dt` of the
-    spline, s.
+    spline, s; `rate_sigma` rad/s and `acceleration_sigma` m/s^2 of the weak motion prior.
     """
 
     fraction: Float[Array, "I S"]
@@ -33,6 +33,8 @@ class InertialData(eqx.Module):
     walk_sigma: Float[Array, "6"]
     start: Float[Array, ""]
     dt: Float[Array, ""]
+    rate_sigma: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(RATE_SIGMA))
+    acceleration_sigma: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(ACCELERATION_SIGMA))
 
 
 class IntervalEquations(eqx.Module):
@@ -143,7 +145,7 @@ def linearise_prior(state: RigState, data: InertialData) -> ChainPrior:
     rotation_residual, position_residual, walk_residual, switch_on = _prior_residuals(state, data)
 
     chain = increments(state.rotations)
-    scale = 1.0 / (_RATE_SIGMA * data.dt)
+    scale = 1.0 / (data.rate_sigma * data.dt)
     left, right = chain.by_left * scale, chain.by_right * scale
     band = band.at[:-1, 0, :3, :3].add(jnp.einsum("kij,kil->kjl", left, left))
     band = band.at[1:, 0, :3, :3].add(jnp.einsum("kij,kil->kjl", right, right))
@@ -151,7 +153,7 @@ def linearise_prior(state: RigState, data: InertialData) -> ChainPrior:
     gradient = gradient.at[:-1, :3].add(jnp.einsum("kij,ki->kj", left, rotation_residual))
     gradient = gradient.at[1:, :3].add(jnp.einsum("kij,ki->kj", right, rotation_residual))
 
-    stencil = jnp.array([1.0, -2.0, 1.0]) / (_ACCELERATION_SIGMA * data.dt**2)
+    stencil = jnp.array([1.0, -2.0, 1.0]) / (data.acceleration_sigma * data.dt**2)
     for a in range(3):
         gradient = gradient.at[a : count - 2 + a, 3:6].add(stencil[a] * position_residual)
         for d in range(3 - a):
@@ -176,9 +178,9 @@ def prior_residuals(state: RigState, data: InertialData) -> Float[Array, " R"]:
 
 
 def _prior_residuals(state: RigState, data: InertialData) -> tuple[Array, Array, Array, Array]:
-    rotation = increments(state.rotations).vector / (_RATE_SIGMA * data.dt)
+    rotation = increments(state.rotations).vector / (data.rate_sigma * data.dt)
     p = state.positions
-    position = (p[:-2] - 2.0 * p[1:-1] + p[2:]) / (_ACCELERATION_SIGMA * data.dt**2)
+    position = (p[:-2] - 2.0 * p[1:-1] + p[2:]) / (data.acceleration_sigma * data.dt**2)
     walk = (state.biases[1:] - state.biases[:-1]) / data.walk_sigma
     return rotation, position, walk, state.biases[0] / _switch_on_sigma()
 

@@ -107,6 +107,12 @@ def align(track: CameraTrack, imu_time_s: np.ndarray, gyro: np.ndarray, name: st
     return Alignment(shift, R_imu_cam.T, bias, correlation, spread)
 
 
+def turning(track: CameraTrack, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """A camera's rate of turn, as a gyroscope would have it: times (n,) between its frames, and rad/s (n, 3)."""
+    start, stop, rate = _camera_rates(track, name)
+    return 0.5 * (start + stop), rate
+
+
 def _median_norm(vectors: np.ndarray) -> float:
     return float(np.median(np.linalg.norm(vectors, axis=1)))
 
