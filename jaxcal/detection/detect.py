@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from jaxcal.detection.cache import DetectionCache, Fingerprinted, detection_key
+from jaxcal.detection.hints import nothing_found
 from jaxcal.detection.pool import detect_in_processes
 from jaxcal.detection.worker import Chunk, Corners, detect_chunk
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import Detections, Frames
 from jaxcal.progress import Progress, no_progress
-from jaxcal.targets import AprilGrid, Checkerboard, Target
+from jaxcal.targets import Target
 
 _CHUNK = 8
 # Starting a process takes as long as detecting in this many frames.
@@ -49,7 +50,7 @@ def detect(
     else:
         progress(f"detect {name}", len(frames), len(frames))
     if not len(detections):
-        raise CalibrationError(_nothing_found(name, len(frames), target))
+        raise CalibrationError(nothing_found(name, frames, target))
     return detections
 
 
@@ -96,21 +97,3 @@ def _merged(frames: Frames, parts: list[Corners]) -> Detections:
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _nothing_found(name: str, num_frames: int, target: Target) -> str:
-    if isinstance(target, Checkerboard):
-        wanted = f"a checkerboard of {target.rows} x {target.cols} inner corners"
-        check = (
-            "rows and columns are counted as INNER corners, one less than squares; the whole board with a white "
-            "margin must be in view"
-        )
-    elif isinstance(target, AprilGrid):
-        wanted = f"an AprilGrid of {target.rows} x {target.cols} tags (36h11, two-bit border)"
-        check = "the grid must be Kalibr's (two-bit black border), with tag 0 at the lower left; tags need about 20 px"
-    else:
-        wanted, check = f"a {type(target).__name__}", "is it the target that was recorded?"
-    return (
-        f"{name}: {wanted} was found in none of {num_frames} frames. Check the target file against the board "
-        f"({check}), and look at a frame: is the board in it, sharp and lit?"
-    )
