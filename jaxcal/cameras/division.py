@@ -42,7 +42,7 @@ class PinholeDivision(CameraModel):
         off_axis, z = length(point[:2]), point[2]
         angle = jnp.arctan2(off_axis, z)
         within = (z > 0.0) & (z * z > 4.0 * self.bend * off_axis**2)
-        return jnp.where(self.bend < 0.0, angle < jnp.pi - 1e-3, within)
+        return jnp.where(self.bend < 0.0, angle < jnp.pi - 1e-6, within)
 
     def unproject(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
         """The ray (3,) of unit length through a pixel (2,)."""

@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 _GRID = (28, 20)  # pixels that stand for the image when none are given
 _CHUNK = 512  # numbers of rays are rounded up to multiples of this: few programs
-_STEPS = 60
+_STEPS = 100
 _TOLERANCE = 1e-10
 _PERFECT_PX = 1e-4  # a fit as good as this needs no other start
 # Weight of rays outside the image, which steady a surface of knots where its model reaches beyond the image.
@@ -120,6 +120,10 @@ def fit_rays(
             f"fit_rays: rays of shape {rays.shape}, pixels of shape {pixels.shape}; expected (M, 3) and (M, 2), M > 0."
         )
     weight = np.ones(len(rays)) if weight is None else np.asarray(weight, dtype=float)
+    if cls.held:
+        # Rays beyond a surface of knots would pull at its edge.
+        first = cls.from_focal(1.0, image_size) if start is None else start
+        weight = weight * _valid(first, rays)
     return _fit(cls, rays, pixels, weight, image_size, start, _focal_of_rays(rays, pixels, image_size))
 
 
@@ -168,6 +172,7 @@ def _levenberg_marquardt(
     free = prior > 0 if prior.any() else np.ones(len(value), dtype=bool)
     # Knots enter linearly: full steps. The others would be thrown far off where the rays say little about them.
     origin, damping = value.copy(), 1e-12 if prior.any() else 1e-4
+    raise_by = 2.0
     cost, gradient, normal = _equations(first, *data)
     for _ in range(_STEPS):
         matrix = (np.asarray(normal) + np.diag(prior))[np.ix_(free, free)]
@@ -181,10 +186,12 @@ def _levenberg_marquardt(
         trial = _equations(first.with_parameters(moved), *data)
         after = float(trial[0]) + 0.5 * prior @ (moved - origin) ** 2
         if np.isfinite(after) and after < before:
-            value, (cost, gradient, normal) = moved, trial
-            damping = max(damping / 10.0, 1e-12)
+            # Nielsen's rule: in a curved valley (xi against k1, say) a fixed factor has every second step refused.
+            gain = (before - after) / max(expected, 1e-300)
+            damping = max(damping * max(1.0 / 5.0, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-12)
+            value, (cost, gradient, normal), raise_by = moved, trial, 2.0
         else:
-            damping *= 10.0
+            damping, raise_by = damping * raise_by, raise_by * 2.0
         if expected <= _TOLERANCE * before + 1e-20 or damping > 1e12:
             break
     return first.with_parameters(value), float(cost)

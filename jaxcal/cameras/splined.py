@@ -79,7 +79,8 @@ class SplinedStereographic(CameraModel):
         """Whether a point (3,) lies where the surface is defined and does not fold the image there."""
         plane = _stereographic(point)
         unfolded = keeps_orientation(lambda u: u + self._surface(u), plane)
-        return jnp.all(jnp.abs(plane) <= jnp.asarray(self.edge())) & unfolded
+        ahead = point[2] > -0.999999 * length(point)  # opposite the axis, where the stereographic projection ends
+        return jnp.all(jnp.abs(plane) <= jnp.asarray(self.edge())) & unfolded & ahead
 
     def regularisation(self) -> Float[Array, " n"]:
         """A prior of 1-sigma one focal length on every knot, far wider than what data say; none on fx, fy, cx, cy.
