@@ -46,6 +46,10 @@ FIELDS = {
     "eucm-none": (30.0, 190.0),
     "pinhole-fov": (30.0, 150.0),
     "pinhole-division": (12.0, 140.0),
+    # Made for wide lenses; a narrow one leaves most of their coefficients open.
+    "pinhole-rational8": (60.0, 110.0),
+    "pinhole-thinprism12": (60.0, 110.0),
+    "pinhole-tilted14": (60.0, 110.0),
 }
 MAX_STEPS = 300
 TOLERANCE = 1e-6

@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 SIZE = 6
+_LOWEST = np.array([-2.0, -1.0, -1e6, -1e6, -4.0, -10.0])
+_HIGHEST = np.array([20.0, 1.0, 1e6, 1e6, 15.0, 10.0])
 # Half fields of view (degrees) tried at the outermost corners, with the alphas that lenses of that kind have.
 _SWEEP = (
     (3.0, (0.0,)),
@@ -84,7 +86,9 @@ class GenericLens:
 
 def _unpack(parameters: np.ndarray) -> tuple[np.ndarray, ...]:
     """fx, fy, cx, cy, alpha, beta, each (B, 1, 1)."""
-    log_f, log_aspect, cx, cy, a, log_beta = (parameters[:, i, None, None] for i in range(SIZE))
+    # Trial steps that go astray stay within what doubles hold.
+    bounded = np.clip(parameters, _LOWEST, _HIGHEST)
+    log_f, log_aspect, cx, cy, a, log_beta = (bounded[:, i, None, None] for i in range(SIZE))
     return (
         np.exp(log_f + 0.5 * log_aspect),
         np.exp(log_f - 0.5 * log_aspect),

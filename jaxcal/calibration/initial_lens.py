@@ -38,6 +38,8 @@ _FIRST_NOISE_PX = 0.1
 _HELD = 1e18
 # Focal lengths tried for the requested model, relative to the one found.
 _FOCAL_FACTORS = (1.0, 0.6, 1.7)
+# A view whose median error is this many times that of most views may stand in a wrong pose.
+_SUSPECT = 1.6
 _POSE_STEPS = 12
 _POSE_CHUNK = 256
 
@@ -322,17 +324,19 @@ def _requested(
     model: type[CameraModel], candidates: Sequence[_Found], views: Views, size: tuple[int, int]
 ) -> tuple[CameraModel, float]:
     """The requested model fitted to the generic lens' views, from several starts while it is worse than that lens."""
+    far = float(max(size))
     best: tuple[float, float, CameraModel] | None = None
     for found in candidates:
         focal = float(np.exp(found.fit.parameters[0, 0]))
         kept = views.with_weight(views.weight * found.good[:, None])
-        for start in (s for factor in _FOCAL_FACTORS for s in model.starts(focal * factor, size)):
-            fit = _fit_model(start, found.fit, kept, float(max(size)))
-            rms_px = _trimmed_rms(ModelLens(start), fit, kept, float(max(size)))
-            logger.debug("%s: %.3f px, cost %.6g, %s", model.name, rms_px, fit.cost[0], fit.parameters[0])
-            if best is None or fit.cost[0] < best[0]:
-                best = (float(fit.cost[0]), rms_px, start.with_parameters(fit.parameters[0]))
-            if best[1] < 1.3 * found.rms_px + 0.05:
+        for factor in _FOCAL_FACTORS:
+            for start in model.starts(focal * factor, size):
+                fit = _fit_model(start, found.fit, kept, far)
+                rms_px = _trimmed_rms(ModelLens(start), fit, kept, far)
+                logger.debug("%s: %.3f px, cost %.6g, %s", model.name, rms_px, fit.cost[0], fit.parameters[0])
+                if best is None or fit.cost[0] < best[0]:
+                    best = (float(fit.cost[0]), rms_px, start.with_parameters(fit.parameters[0]))
+            if best is not None and best[1] < 1.3 * found.rms_px + 0.05:
                 return best[2], best[1]
     assert best is not None
     return best[2], best[1]
@@ -347,12 +351,44 @@ def _fit_model(start: CameraModel, generic: Fit, views: Views, far: float) -> Fi
     fit = Fit(np.asarray(start.parameters)[None], generic.rotation, generic.translation, np.array([np.inf]))
     for cap in (0.05 * far, 0.25 * far, far):
         fit = fit_lenses(lens, fit, views, steps=15, width=0.02 * far, cap=cap, prior=prior, hold_poses=True, rtol=1e-2)
-    for _ in range(3):
-        fit = fit_lenses(lens, fit, views, steps=40, width=_HUBER_PX, cap=far, prior=prior)
-        fit, swapped = _swap_mirrored(lens, fit, views, far)
-        if not swapped:
+    fit = _joint_fit(lens, fit, views, prior, far)
+    for _ in range(2):
+        better = _without_suspects(lens, fit, views, prior, far)
+        if better is None:
             break
+        fit = better
     return fit
+
+
+def _joint_fit(lens: Lens, fit: Fit, views: Views, prior: tuple[np.ndarray, np.ndarray], far: float) -> Fit:
+    """Lens and poses together, until no pose is better mirrored."""
+    for _ in range(3):
+        best = fit_lenses(lens, fit, views, steps=40, width=_HUBER_PX, cap=far, prior=prior)
+        fit, swapped = _swap_mirrored(lens, best, views, far)
+        if not swapped:
+            return best
+    return fit_lenses(lens, fit, views, steps=40, width=_HUBER_PX, cap=far, prior=prior)
+
+
+def _without_suspects(
+    lens: Lens, fit: Fit, views: Views, prior: tuple[np.ndarray, np.ndarray], far: float
+) -> Fit | None:
+    """A better fit that leaves out, for a while, the views it explains worst; None where there is none.
+
+    A lens can bend itself to the wrong one of a view's two poses, which then is the better one for that lens.
+    """
+    errors = np.sqrt(squared_errors(lens, fit, views, far)[0])
+    seen = views.weight.sum(axis=1) > 0
+    median = np.array([np.median(e[w > 0]) if w.any() else 0.0 for e, w in zip(errors, views.weight, strict=True)])
+    suspect = seen & (median > max(_SUSPECT * float(np.median(median[seen])), float(np.quantile(median[seen], 0.8))))
+    if not suspect.any():
+        return None
+    trial = fit_lenses(
+        lens, fit, views.with_weight(views.weight * ~suspect[:, None]), steps=20, width=_HUBER_PX, cap=far, prior=prior
+    )
+    trial, _ = _swap_mirrored(lens, trial, views, far)
+    trial = _joint_fit(lens, trial, views, prior, far)
+    return trial if trial.cost[0] < fit.cost[0] * (1.0 - 1e-4) else None
 
 
 def _advice(half_degrees: float) -> str:
