@@ -73,11 +73,6 @@ def camera_frames(detections: Detections, target: Target, name: str, min_corners
         )
     corners_per_frame = np.bincount(detections.frame, minlength=len(detections.timestamps_ns))
     frames = np.flatnonzero(corners_per_frame >= min(min_corners, count))
-    if len(frames) < 3:
-        raise CalibrationError(
-            f"{name}: {len(frames)} frames with at least {min_corners} corners; 3 are the least, 20 or more are "
-            "needed for a good calibration. Is the target description right, and was the board in view?"
-        )
     row_of = np.full(len(corners_per_frame), -1)
     row_of[frames] = np.arange(len(frames))
     row = row_of[detections.frame]
@@ -86,7 +81,34 @@ def camera_frames(detections: Detections, target: Target, name: str, min_corners
     seen = np.zeros((len(frames), count), dtype=bool)
     pixels[row[used], detections.point[used]] = detections.pixels[used]
     seen[row[used], detections.point[used]] = True
-    return CameraFrames(detections, frames, detections.timestamps_ns[frames], pixels, seen)
+    in_line = _in_line(target.points, seen)
+    if np.sum(~in_line) < 3:
+        raise CalibrationError(_too_few_frames(name, int(np.sum(~in_line)), int(in_line.sum()), min_corners))
+    dense = CameraFrames(detections, frames, detections.timestamps_ns[frames], pixels, seen)
+    return dense.take(np.flatnonzero(~in_line)) if in_line.any() else dense
+
+
+def _in_line(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Frames (F,) whose seen (F, N) points of (N, 3) lie along one line: their second principal extent vanishes."""
+    share = seen / np.maximum(seen.sum(axis=1, keepdims=True), 1)
+    middle = share @ points
+    moments = np.einsum("fn,ni,nj->fij", share, points, points, optimize=True)
+    extent = np.linalg.eigvalsh(moments - middle[:, :, None] * middle[:, None, :])
+    return extent[:, 1] < 1e-6 * extent[:, 2]
+
+
+def _too_few_frames(name: str, count: int, in_line: int, min_corners: int) -> str:
+    if in_line:
+        return (
+            f"{name}: {count} frames with at least {min_corners} corners that do not lie along one line, and {in_line} "
+            "whose corners do; 3 are the least. A line shows neither where the board is nor the lens: focal length, "
+            "principal point and distortion stay open. Record views in which several rows and columns are found."
+        )
+    return (
+        f"{name}: {count} frames with at least {min_corners} corners; 3 are the least, 20 or more are needed for a "
+        "good calibration. Beyond its own pose a view of a flat board tells two numbers of the lens, so that focal "
+        "length, principal point and distortion stay open. Is the target description right, and was the board in view?"
+    )
 
 
 def round_up(count: int, step: int) -> int:

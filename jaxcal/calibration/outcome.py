@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.calibration import outliers, uncertainty
+from jaxcal.calibration import observability, outliers, uncertainty
 from jaxcal.calibration.assemble import CameraFrames, split_groups
 from jaxcal.calibration.checks import versions
 from jaxcal.calibration.robust import RobustFit, camera_poses
@@ -79,9 +79,26 @@ def calibration_from(
                 timeshift_cam_cam0=float(state.shift[c]) if with_time and imu is None else None,
             )
         )
-    sentences = [*warnings, *outliers.rejection_warnings(names, seen, fit.kept)]
+    shape = _target_shape(state, layout)
+    open_questions = observability.advice(
+        names,
+        models,
+        layout,
+        covariance,
+        np.asarray(fit.problem.free),
+        cameras,
+        fit.kept,
+        poses,
+        target.points if shape is None else shape.points(target),
+        # Cameras that move along a spline take their pictures each for itself.
+        split_groups(layout, cameras, [np.asarray(data.view) for data in fit.problem.corners])
+        if fit.problem.order == 1
+        else None,
+    )
+    sentences = [*open_questions, *warnings, *outliers.rejection_warnings(names, seen, fit.kept)]
     if not bool(fit.result.converged):
-        sentences.insert(0, "The optimisation stopped before it converged. Do not use this result.")
+        reason = ", because the recording leaves parameters open" if open_questions else ""
+        sentences.insert(0, f"The optimisation stopped before it converged{reason}. Do not use this result.")
     history = np.asarray(fit.result.history)
     return Calibration(
         cameras=tuple(results),
@@ -95,7 +112,7 @@ def calibration_from(
         settings=dict(settings),
         versions=versions(),
         converged=bool(fit.result.converged),
-        target_shape=_target_shape(state, layout),
+        target_shape=shape,
     )
 
 
