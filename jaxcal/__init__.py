@@ -23,7 +23,10 @@ _EXPORTS = {
     "ImuNoise": "jaxcal.observations",
     "ImuRecording": "jaxcal.observations",
     "AprilGrid": "jaxcal.targets",
+    "BoardSet": "jaxcal.targets",
+    "Charuco": "jaxcal.targets",
     "Checkerboard": "jaxcal.targets",
+    "CircleGrid": "jaxcal.targets",
     "Target": "jaxcal.targets",
     "load_target": "jaxcal.targets",
     "CameraModel": "jaxcal.cameras",
@@ -49,7 +52,7 @@ if TYPE_CHECKING:
     from jaxcal.pipeline import run_pipeline
     from jaxcal.recording import load_imu, load_rig
     from jaxcal.results import Calibration, load_calibration
-    from jaxcal.targets import AprilGrid, Checkerboard, Target, load_target
+    from jaxcal.targets import AprilGrid, BoardSet, Charuco, Checkerboard, CircleGrid, Target, load_target
 
 
 def __getattr__(name: str) -> Any:

@@ -15,6 +15,8 @@ _FEWEST = 8  # seen corners in a neighbourhood; a homography has 8 freedoms in 2
 # A view fits when the median neighbourhood's misfit is below this share of its size: noise of a pixel in a
 # neighbourhood of 20, or the strongest lens, stays below; wrong numbers give a third and more.
 _FITS = 0.06
+_ROUNDS = 6
+_GOOD_SHARE = 0.7  # of a neighbourhood's corners are taken to be in the right place
 _NEARLY_ALL, _MOST = 0.9, 0.8
 _STRAY = 0.2  # so many views may be odd ones, which calibration leaves out
 
@@ -58,7 +60,7 @@ def _check_one(where: str, frame: np.ndarray, pixels: np.ndarray, seen: np.ndarr
     if views.share < 1.0 - _STRAY:
         _explain(where, pixels, seen, board)
     mirrored = views.fits & views.mirrored
-    if mirrored.sum() > _NEARLY_ALL * views.fits.sum() and views.share >= _MOST:
+    if mirrored.sum() > _NEARLY_ALL * views.fits.sum() and views.share >= 0.5:
         raise CalibrationError(
             f"{where}: the corners are those of a MIRRORED board: in all views, columns running right and rows running "
             "up would show it from behind. Number the points row by row from the lower LEFT (rows counted from the top "
@@ -79,7 +81,7 @@ def _check_one(where: str, frame: np.ndarray, pixels: np.ndarray, seen: np.ndarr
     odd = views.judged & ~views.fits
     if odd.any() and odd.sum() >= 0.02 * judged:
         sentences.append(
-            f"{where}: in {odd.sum()} of {judged} views the corners are not where one view of the board would have "
+            f"{where}: in {odd.sum()} of {judged} views many corners are not where one view of the board would have "
             f"them ({_frames(frame[odd])}): they are numbered wrongly, or were not found on the board."
         )
     return sentences
@@ -168,9 +170,10 @@ def _judge(pixels: np.ndarray, seen: np.ndarray, layout: np.ndarray) -> _Views:
 def _fit(board: np.ndarray, pixels: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Homographies from `board` (1, P, K, 2) to `pixels` (F, P, K, 2) where `seen` (F, P, K).
 
-    Returns the misfit (F, P) as a share of the neighbourhood's size, NaN where too few corners are seen or lie in a
-    line, and whether the map turns right hands into left ones, that is, shows the board from behind (image y runs down,
-    board y up). Direct linear transform, as in Hartley & Zisserman, algorithm 4.2.
+    Returns the misfit (F, P) of all but the worst corners as a share of the neighbourhood's size, NaN where too few are
+    seen or they lie in a line, and whether the map turns right hands into left ones, that is, shows the board from
+    behind (image y runs down, board y up). Direct linear transform, as in Hartley & Zisserman, algorithm 4.2, repeated
+    with Cauchy weights, so that single corners in the wrong place do not count.
     """
     weight = seen.astype(np.float64)[..., None]
     count = np.maximum(weight.sum(axis=2, keepdims=True), 1.0)
@@ -179,19 +182,31 @@ def _fit(board: np.ndarray, pixels: np.ndarray, seen: np.ndarray) -> tuple[np.nd
     x, y = np.moveaxis(source, -1, 0)
     u, v = np.moveaxis(target, -1, 0)
     one, zero = np.ones_like(x), np.zeros_like(x)
-    rows_u = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=-1) * weight
-    rows_v = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=-1) * weight
-    system = np.concatenate([rows_u, rows_v], axis=2)
-    _, vectors = np.linalg.eigh(np.einsum("fpki,fpkj->fpij", system, system))
-    homography = vectors[..., 0].reshape(*vectors.shape[:2], 3, 3)
-    mapped = np.einsum("fpij,fpkj->fpki", homography, np.stack([x, y, one], axis=-1))
-    depth = mapped[..., 2]
-    error = mapped[..., :2] / np.where(np.abs(depth) < 1e-9, 1e-9, depth)[..., None] - target
-    misfit = np.sqrt((np.sum(error**2, axis=-1) * weight[..., 0]).sum(axis=2) / count[..., 0, 0])
+    rows_u = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=-1)
+    rows_v = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=-1)
+    system = np.einsum("fpki,fpkj->fpkij", rows_u, rows_u) + np.einsum("fpki,fpkj->fpkij", rows_v, rows_v)
+    trust, homography, error = weight[..., 0], np.eye(3), weight[..., 0]
+    for _ in range(_ROUNDS):
+        _, vectors = np.linalg.eigh(np.einsum("fpk,fpkij->fpij", trust, system))
+        homography = vectors[..., 0].reshape(*vectors.shape[:2], 3, 3)
+        mapped = np.einsum("fpij,fpkj->fpki", homography, np.stack([x, y, one], axis=-1))
+        depth = np.where(np.abs(mapped[..., 2:]) < 1e-9, 1e-9, mapped[..., 2:])
+        error = np.linalg.norm(mapped[..., :2] / depth - target, axis=-1)
+        size = _typical(error, seen)
+        # The linear system weighs each corner by its depth as well; dividing by it leaves distances.
+        trust = weight[..., 0] / depth[..., 0] ** 2 / (1.0 + (error / np.maximum(size, 1e-3)[..., None]) ** 2)
+        trust = trust / np.maximum(trust.max(axis=2, keepdims=True), 1e-30)
     # The Jacobian's determinant of a homography is det(H) / depth^3; the neighbourhood's middle is at (0, 0).
     mirrored = np.linalg.det(homography) * homography[..., 2, 2] > 0.0
     enough = (seen.sum(axis=2) >= _FEWEST) & (spread > 0.1)
-    return np.where(enough, misfit, np.nan), mirrored
+    return np.where(enough, _typical(error, seen), np.nan), mirrored
+
+
+def _typical(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """What `_GOOD_SHARE` of the seen ones of values (F, P, K) do not exceed (F, P); infinite where none is seen."""
+    ordered = np.sort(np.where(seen, values, np.inf), axis=-1)
+    place = np.ceil(_GOOD_SHARE * seen.sum(axis=-1)).astype(int) - 1
+    return np.take_along_axis(ordered, np.maximum(place, 0)[..., None], axis=-1)[..., 0]
 
 
 def _normalised(points: np.ndarray, weight: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

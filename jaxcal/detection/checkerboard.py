@@ -13,7 +13,7 @@ from jaxcal.targets import Checkerboard
 # without a board and found no board more, in real images and in noise of 30 grey levels.
 _FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE
 _MAX_HALF_WINDOW = 10
-_ENOUGH_ALTERNATE = 0.8
+_ENOUGH_ALTERNATE, _ENOUGH_ON_A_SIDE = 0.8, 0.5
 _REACH = 0.4  # of the distance to the nearest corner
 
 
@@ -51,16 +51,18 @@ def _find(image: np.ndarray, target: Checkerboard) -> np.ndarray | None:
 
 
 def _colours_alternate(image: np.ndarray, grid: np.ndarray) -> bool:
-    """Whether opposite squares at a corner are alike and neighbours differ, at nearly all corners.
+    """Whether opposite squares at a corner are alike and neighbours differ, at nearly all corners, along each side too.
 
-    Boards of three rows are sometimes found one square off, with their outline among the corners.
+    Boards of three rows are sometimes found one square off, and boards of one row less than asked for with a row too
+    many: then the board's outline is among the corners.
     """
     along, up = np.gradient(grid, axis=1) * 0.3, np.gradient(grid, axis=0) * 0.3
     squares = np.stack([grid + along + up, grid - along - up, grid + along - up, grid - along + up])
     grey = _grey_at(image, squares)
     one, other = grey[:2], grey[2:]
     alternate = (one.max(axis=0) < other.min(axis=0)) | (one.min(axis=0) > other.max(axis=0))
-    return bool(alternate.mean() > _ENOUGH_ALTERNATE)
+    sides = (alternate[0], alternate[-1], alternate[:, 0], alternate[:, -1])
+    return bool(alternate.mean() > _ENOUGH_ALTERNATE and min(side.mean() for side in sides) > _ENOUGH_ON_A_SIDE)
 
 
 def _grey_at(image: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxcal.detection.cache import DetectionCache, Fingerprinted, detection_key
-from jaxcal.detection.hints import nothing_found
+from jaxcal.detection.hints import larger_board, nothing_found
 from jaxcal.detection.pool import detect_in_processes
 from jaxcal.detection.worker import Chunk, Corners, detect_chunk
 from jaxcal.errors import CalibrationError
@@ -36,7 +36,8 @@ def detect(
     same; an interrupted run continues where it stopped. All frames are listed in the result, also those without
     corners.
 
-    Raises CalibrationError when no frame shows the target, or an image cannot be read.
+    Raises CalibrationError when no frame shows the target, when it is a part of a larger checkerboard, or when an
+    image cannot be read.
     """
     if workers is not None and workers < 1:
         raise CalibrationError(f"detect: workers is {workers}; expected at least 1, or None for one per core.")
@@ -45,6 +46,9 @@ def detect(
     if detections is None:
         parts = _all_parts(frames, target, workers or _cores(), store, progress, f"detect {name}")
         detections = _merged(frames, parts)
+        larger = larger_board(name, frames, detections.seen_frames, target) if len(detections) else ""
+        if larger:
+            raise CalibrationError(larger)
         if store:
             store.save(detections)
     else:

@@ -1,4 +1,4 @@
-"""When a target is never found: is another one there, one row more or less, or with other tags?"""
+"""Is another target there than the one described: a row more or less, other tags, another pattern?"""
 
 import dataclasses
 
@@ -10,6 +10,7 @@ from jaxcal.observations import Frames
 from jaxcal.targets import AprilGrid, Charuco, Checkerboard, CircleGrid, Target
 
 _LOOKED_AT = 8  # frames, evenly over the recording
+_PROBES = 3  # frames in which a larger board is looked for
 _ENOUGH_TAGS = 2  # in one frame; a single one may be a chance
 
 
@@ -40,6 +41,26 @@ def nothing_found(name: str, frames: Frames, target: Target) -> str:
         f"{name}: {wanted} was found in none of {len(frames)} frames. {hint}Check the target file against the board "
         f"({check}), and look at a frame: is the board in it, sharp and lit?"
     )
+
+
+def larger_board(name: str, frames: Frames, seen_frames: np.ndarray, target: Target) -> str:
+    """The message for a checkerboard that was found as a part of a larger one; empty where it was not.
+
+    Any part of the right size would do then, another in each frame, and the corners' numbers would mean nothing.
+    """
+    if not isinstance(target, Checkerboard):
+        return ""
+    chosen = np.unique(seen_frames[np.linspace(0, len(seen_frames) - 1, _PROBES).round().astype(int)])
+    images = [frames.images[int(number)] for number in chosen]
+    for rows, cols in ((target.rows + 1, target.cols), (target.rows, target.cols + 1)):
+        larger = dataclasses.replace(target, rows=rows, cols=cols)
+        if all(len(find_corners(image, larger)[0]) for image in images):
+            return (
+                f"{name}: the board has more inner corners than the target's {target.rows} x {target.cols}: at least "
+                f"{rows} x {cols} were found in each of {len(images)} frames looked at. Correct the target; with too "
+                "few rows or columns, another part of the board would be taken for it in each frame."
+            )
+    return ""
 
 
 def _what_is_there(frames: Frames, target: Target) -> str:

@@ -11,7 +11,7 @@ from jaxcal.errors import CalibrationError
 from jaxcal.observations import Detections, ImuRecording
 from jaxcal.simulation.motion import poses_at, rates
 from jaxcal.simulation.rig import SimulatedCamera, SimulatedRig
-from jaxcal.targets import AprilGrid
+from jaxcal.targets import AprilGrid, Charuco
 
 # Purposes of the rig's random generators.
 _IMU, _DETECTIONS = 11, 12
@@ -51,8 +51,8 @@ def simulate_detections(
     """Corners that a perfect detector with Gaussian noise would give for camera `index` of the rig.
 
     `noise_px` is the standard deviation of each coordinate. Corners closer than `border_px` to the image's edge, or
-    not seen at all, are dropped: for a checkerboard the whole frame, for an AprilGrid the tag. A fraction
-    `outlier_fraction` of the corners is displaced by Gaussian noise of `outlier_px` per coordinate.
+    not seen at all, are dropped: for a checkerboard or circle grid the whole frame, for an AprilGrid the tag. A
+    fraction `outlier_fraction` of the corners is displaced by Gaussian noise of `outlier_px` per coordinate.
     """
     camera = rig.cameras[index]
     times_ns = rig.frame_times_ns(camera)
@@ -72,7 +72,9 @@ def simulate_detections(
 
 
 def _whole_features(rig: SimulatedRig, seen: np.ndarray) -> np.ndarray:
-    """Keep of `seen` (F, N) what a detector could find: whole tags of an AprilGrid, else whole boards."""
+    """Keep of `seen` (F, N) what a detector could find: whole tags, single ChArUco corners, else whole boards."""
+    if isinstance(rig.target, Charuco):
+        return seen
     if not isinstance(rig.target, AprilGrid):
         return seen & seen.all(axis=1, keepdims=True)
     whole = np.zeros_like(seen)

@@ -59,14 +59,20 @@ def test_what_is_there_instead_is_said(shown: Target, stated: Target, said: str)
     assert said in str(caught.value)
 
 
+def test_a_part_of_a_larger_board_is_refused() -> None:
+    """OpenCV does find parts of boards where they have three rows."""
+    with pytest.raises(CalibrationError, match=r"left: the board has more .* at least 4 x 5 were found in each of 3"):
+        detect(frames_of(Checkerboard(4, 5, 0.06)), Checkerboard(3, 5, 0.06), workers=1, name="left")
+
+
 def test_tags_with_a_narrow_border_are_named() -> None:
     image = np.full((240, 320), 235, np.uint8)
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    for number, (x, y) in enumerate([(30, 30), (180, 30), (30, 140), (180, 140)]):
+    for number, (x, y) in enumerate([(30, 30), (180, 30), (30, 140), (180, 140)], start=36):
         image[y : y + 80, x : x + 80] = cv2.aruco.generateImageMarker(dictionary, number, 80, None, 1)
     frames = Frames(np.arange(2), [image, image], SIZE)
-    with pytest.raises(CalibrationError, match=r"ids 0 to 3 with a ONE-bit border, which is not Kalibr's"):
-        detect(frames, AprilGrid(2, 2, 0.08, 0.3), workers=1)
+    with pytest.raises(CalibrationError, match=r"ids 36 to 39 with a ONE-bit border, which is not Kalibr's"):
+        detect(frames, AprilGrid(2, 2, 0.08, 0.3, first_id=36), workers=1)
 
 
 def test_where_nothing_is_there_nothing_is_claimed() -> None:
