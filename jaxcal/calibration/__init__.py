@@ -2,5 +2,6 @@
 
 from jaxcal.calibration.camera_imu import calibrate_camera_imu
 from jaxcal.calibration.cameras import calibrate_cameras
+from jaxcal.calibration.validation import held_back_residuals
 
-__all__ = ["calibrate_camera_imu", "calibrate_cameras"]
+__all__ = ["calibrate_camera_imu", "calibrate_cameras", "held_back_residuals"]

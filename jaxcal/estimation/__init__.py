@@ -11,7 +11,7 @@ from jaxcal.estimation.block_arrow import (
 from jaxcal.estimation.descent import BlockArrowDescent, BlockStep, damped_step
 from jaxcal.estimation.losses import LOSSES, Loss, barron, huber, robust_loss
 from jaxcal.estimation.problem import BlockArrowProblem, State
-from jaxcal.estimation.solver import BlockArrowLevenbergMarquardt, SolveResult, solve
+from jaxcal.estimation.solver import BlockArrowLevenbergMarquardt, SolveResult, solve, solve_inside
 from jaxcal.estimation.threads import single_threaded_blas
 
 __all__ = [
@@ -35,4 +35,5 @@ __all__ = [
     "robust_loss",
     "single_threaded_blas",
     "solve",
+    "solve_inside",
 ]

@@ -19,6 +19,7 @@ from jaxcal.estimation.threads import single_threaded_blas
 _MAX_HISTORY = 256
 _FIRST_DAMPING = 1e-4
 _LARGEST_DAMPING = 1e14
+_NO_LIMIT = 10**9
 
 
 class _LoopState(eqx.Module):
@@ -104,10 +105,12 @@ class BlockArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def terminate(
         self, fn: Any, y: State, args: Any, options: dict[str, Any], state: _LoopState, tags: Any
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        spent = state.iteration >= options.get("max_steps", _NO_LIMIT)
         result = optx.RESULTS.where(
-            state.stuck & ~state.converged, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+            spent & ~state.converged, optx.RESULTS.nonlinear_max_steps_reached, optx.RESULTS.successful
         )
-        return state.converged | state.stuck, result
+        result = optx.RESULTS.where(state.stuck & ~state.converged, optx.RESULTS.nonlinear_divergence, result)
+        return state.converged | state.stuck | spent, result
 
     def postprocess(
         self,
@@ -178,17 +181,25 @@ def solve(
     """
     solver = solver or BlockArrowLevenbergMarquardt()
     with single_threaded_blas():
-        return jax.block_until_ready(_solve(problem, state, solver, max_steps, adjoint))
+        # The limit on steps is data of the program, so that calls with other limits need not compile another one.
+        return jax.block_until_ready(
+            _solve(problem, state, solver=solver, max_steps=jnp.asarray(max_steps), adjoint=adjoint)
+        )
 
 
-@eqx.filter_jit
-def _solve(
+def solve_inside(
     problem: BlockArrowProblem,
     state: State,
-    solver: BlockArrowLevenbergMarquardt,
-    max_steps: int,
-    adjoint: optx.AbstractAdjoint | None,
+    *,
+    solver: BlockArrowLevenbergMarquardt | None = None,
+    max_steps: int | Int[Array, ""] = 100,
+    adjoint: optx.AbstractAdjoint | None = None,
 ) -> SolveResult:
+    """`solve` as a part of a larger jitted computation: many small problems under `lax.map`, say.
+
+    Run that computation under `single_threaded_blas`, as `solve` does by itself.
+    """
+    solver = solver or BlockArrowLevenbergMarquardt()
 
     # optimistix traces the residual function, which this solver never evaluates: it works on normal equations.
     def untouched(y: State, args: Any) -> Array:
@@ -198,10 +209,13 @@ def _solve(
         untouched,
         solver,
         state,
-        options={"problem": problem},
-        max_steps=max_steps,
+        options={"problem": problem, "max_steps": max_steps},
+        max_steps=None,
         throw=False,
         adjoint=adjoint or _NoAdjoint(),
     )
     stats = solution.stats
     return SolveResult(solution.value, stats["equations"], stats["history"], stats["iterations"], stats["converged"])
+
+
+_solve = eqx.filter_jit(solve_inside)

@@ -13,6 +13,7 @@ from simulated_truth import perturbation
 from jaxcal import (
     AprilGrid,
     Checkerboard,
+    Detections,
     Frames,
     ImuNoise,
     ImuRecording,
@@ -22,6 +23,7 @@ from jaxcal import (
     load_imu,
     load_target,
 )
+from jaxcal.calibration import held_back_residuals
 from jaxcal.recording.tables import load_detections
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
@@ -58,6 +60,77 @@ def test_opencv_left_camera(data_folder: Path) -> None:
     _, matrix, *_ = cv2.calibrateCamera(points, pixels, (640, 480), None, None, flags=cv2.CALIB_FIX_K3)  # pyright: ignore
     theirs = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
     assert np.all(np.abs(np.asarray(camera.model.intrinsics) - theirs) < calibration.std("cam0.intrinsics"))
+
+
+def fisheye_24mp(data_folder: Path, views: slice) -> tuple[Checkerboard, Detections]:
+    """mrcal's corners of a 6016x4016 fisheye; its detector says how well it found each (1, 1/2 or 1/4)."""
+    with np.load(data_folder / "real_fisheye_24mp" / "observations.npz") as table:
+        pixels, weight = table["pixels"][views], table["weight"][views]
+    count = len(pixels)
+    pixels, weight = pixels.reshape(count, -1, 2), weight.reshape(count, -1)
+    frame, point = np.nonzero(weight > 0)
+    times = np.arange(count) * 1_000_000_000
+    detections = Detections(times, frame, point, pixels[frame, point], (6016, 4016), weight[frame, point])
+    return Checkerboard(rows=10, cols=10, spacing=0.077), detections
+
+
+def weighted_rms(residuals: np.ndarray, precision: np.ndarray, used: np.ndarray) -> float:
+    """RMS of one coordinate, px, weighted by precision, as mrcal reports it."""
+    return float(np.sqrt(np.mean((residuals * precision[:, None])[used] ** 2)))
+
+
+def test_a_large_fisheye_and_its_bent_board(data_folder: Path) -> None:
+    """mrcal reaches 0.47 px with a board warp of -1.04 and 0.53 mm, and 0.78 px without, on twice as many views."""
+    board, detections = fisheye_24mp(data_folder, slice(None))
+    assert detections.precision is not None
+    limits = {False: 0.82, True: 0.50}
+    for warp, limit in limits.items():
+        calibration = calibrate_cameras([detections], board, ["pinhole-rational8"], board_warp=warp)
+        (camera,) = calibration.cameras
+        rms = weighted_rms(camera.residuals_px, detections.precision, camera.used)
+        log.info("warp %s: rms %.3f px, rejected %.2f %%", warp, rms, 100 * (1 - camera.inlier.mean()))
+        assert calibration.converged
+        assert rms <= limit
+        assert camera.inlier.mean() > 0.97
+        if warp:
+            assert calibration.target_shape is not None
+            log.info("warp %s m", calibration.target_shape.warp_m)
+            assert calibration.target_shape.warp_m == pytest.approx([-1.04e-3, 0.53e-3], abs=1e-4)
+
+
+def test_a_splined_lens_is_better_than_a_rational_one_on_views_held_back(data_folder: Path) -> None:
+    board, made_from = fisheye_24mp(data_folder, slice(0, None, 2))
+    _, held_back = fisheye_24mp(data_folder, slice(1, None, 2))
+    assert held_back.precision is not None
+    scores = {}
+    for model in ("pinhole-rational8", "splined-3-16-11-150"):
+        calibration = calibrate_cameras([made_from], board, [model], board_warp=True)
+        (residuals,) = held_back_residuals(calibration, [held_back])
+        # Few corners are wrong, and those by much: the median tells which lens is nearer.
+        error = np.linalg.norm(residuals * held_back.precision[:, None], axis=1)
+        scores[model] = float(np.median(error))
+        log.info("%s: held back %.3f px (median), %.3f px (trimmed rms)", model, scores[model], _trimmed(error))
+    assert scores["splined-3-16-11-150"] < scores["pinhole-rational8"]
+
+
+def _trimmed(error: np.ndarray) -> float:
+    kept = np.sort(error)[: int(0.97 * len(error))]
+    return float(np.sqrt(np.mean(kept**2) / 2))
+
+
+def test_euroc_cameras_without_the_imu(data_folder: Path) -> None:
+    path = data_folder / "euroc_imu_april" / "observations.npz"
+    target = AprilGrid(rows=6, cols=6, tag_size=0.088, tag_spacing=0.3)
+    detections = [load_detections(path, target, (752, 480), name) for name in ("cam0", "cam1")]
+    calibration = calibrate_cameras(detections, target)
+    for camera, focal in zip(calibration.cameras, EUROC_FOCALS, strict=True):
+        log.info("%s: %s, rms %.3f px", camera.name, np.asarray(camera.model.intrinsics), camera.reprojection_rms_px)
+        assert np.asarray(camera.model.intrinsics[:2]) == pytest.approx(np.array(focal), rel=0.008)
+    second = calibration.cameras[1]
+    assert second.T_cn_cnm1 is not None
+    baseline = float(np.linalg.norm(second.T_cn_cnm1[:3, 3]))
+    log.info("baseline %.5f m", baseline)
+    assert baseline == pytest.approx(0.11007, abs=1e-3)
 
 
 def test_kalibrs_own_corners_give_at_most_kalibrs_errors(data_folder: Path) -> None:
