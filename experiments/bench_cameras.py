@@ -48,6 +48,7 @@ START = np.array([430.0, 430.0, 375.5, 239.5, 0.0, 0.0, 0.0, 0.0])
 NOISE_PX = 0.2
 REPEATS = 5
 BATCH = 64
+FOLDER = os.path.dirname(os.path.abspath(__file__))
 PARTS = ("mono", "rig", "batch", "whole", "memory")
 
 
@@ -207,6 +208,8 @@ def _bench_multiview(case: Case, views: int, ours: Timing) -> None:
         pixels.append([view.reshape(-1, 1, 2) for view in per_view])
     points = [BOARD.points.astype(np.float32)] * views
 
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS
+
     def call() -> float:
         rms, *_ = cv2.calibrateMultiview(
             points,
@@ -218,9 +221,7 @@ def _bench_multiview(case: Case, views: int, ours: Timing) -> None:
             [np.zeros(5) for _ in whole],
             None,
             None,
-            flagsForIntrinsics=np.full(
-                (len(whole), 1), cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS, dtype=np.int32
-            ),
+            flagsForIntrinsics=np.full((len(whole), 1), flags, dtype=np.int32),
             flags=cv2.CALIB_USE_INTRINSIC_GUESS,
         )
         return 0.5 * rms**2 * sum(int(frames.seen.sum()) for frames in whole)
@@ -281,7 +282,7 @@ def make_detections(views: int, cameras: int) -> list[Detections]:
 
 
 def bench_whole() -> None:
-    script = WHOLE.format(folder=os.path.dirname(os.path.abspath(__file__)))
+    script = WHOLE.format(folder=FOLDER)
     rows = []
     for _ in range(4):
         wall = time.perf_counter()
@@ -300,7 +301,7 @@ def bench_whole() -> None:
 def bench_memory() -> None:
     for views in (100, 1000, 4000):
         code = (
-            f"import sys; sys.path.insert(0, {os.path.dirname(os.path.abspath(__file__))!r}); import bench_cameras as b, resource; "
+            f"import sys; sys.path.insert(0, {FOLDER!r}); import resource; import bench_cameras as b; "
             f"case = b.make_case({views}, 1); b.solve(case.problem, case.state); "
             "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
         )

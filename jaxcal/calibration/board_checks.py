@@ -39,8 +39,9 @@ def check_board(name: str, frames: CameraFrames, target: Target) -> list[str]:
     """Compare the numbering of one camera's corners with the board; sentences about what is odd.
 
     Homographies are fitted in small neighbourhoods, within which any lens is nearly a pinhole. Raises CalibrationError,
-    with a remedy, where the corners can only be those of a mirrored board, of a board with rows and columns swapped or
-    with rows of another length, or are numbered now one way, now another.
+    with a remedy, where the corners can only be those of a board with rows and columns swapped or with rows of another
+    length, or are numbered now one way, now another. A board mirrored in all views is said, but calibrates all the
+    same: a plane seen from behind is a plane.
     """
     sentences = []
     for number, board in enumerate(target.boards):
@@ -61,11 +62,12 @@ def _check_one(where: str, frame: np.ndarray, pixels: np.ndarray, seen: np.ndarr
         _explain(where, pixels, seen, board)
     mirrored = views.fits & views.mirrored
     if mirrored.sum() > _NEARLY_ALL * views.fits.sum() and views.share >= 0.5:
-        raise CalibrationError(
+        return [
             f"{where}: the corners are those of a MIRRORED board: in all views, columns running right and rows running "
-            "up would show it from behind. Number the points row by row from the lower LEFT (rows counted from the top "
-            "are the usual cause), or undo the mirroring of the images."
-        )
+            "up would show it from behind. Where points are only numbered from the top, as OpenCV does, nothing but the "
+            "target's frame is turned over (its z axis points into the board); were the images themselves mirrored, "
+            "undo that. Number the points row by row from the lower LEFT."
+        ]
     if mirrored.sum() > _STRAY * views.fits.sum():
         raise CalibrationError(
             f"{where}: the corners are numbered differently from view to view: {mirrored.sum()} of {judged} views "

@@ -72,8 +72,9 @@ def test_right_numbers_pass_in_silence(board: Target, fisheye: bool, seed: int) 
 def test_points_numbered_from_the_top_are_a_mirrored_board(board: Target, fisheye: bool) -> None:
     pixels = seen_by(board, poses(board, 12, 1), fisheye)
     flipped = pixels * [1, -1] + [0, SIZE[1]]
-    with pytest.raises(CalibrationError, match=r"left.*MIRRORED board.*lower LEFT"):
-        check_board("left", frames_of(board, flipped), board)
+    (sentence,) = check_board("left", frames_of(board, flipped), board)
+    assert sentence.startswith("left: the corners are those of a MIRRORED board")
+    assert "lower LEFT" in sentence
 
 
 @pytest.mark.parametrize(
@@ -153,8 +154,8 @@ def test_each_board_of_a_set_is_checked() -> None:
     pixels = seen_by(boards[0], poses(boards[0], 12, 8), False)
     both = np.concatenate([pixels, pixels * [1, -1] + [0, SIZE[1]]], axis=1)
     target = BoardSet(boards)
-    with pytest.raises(CalibrationError, match="cam0, board 1: the corners are those of a MIRRORED"):
-        check_board("cam0", frames_of(target, both), target)
+    (sentence,) = check_board("cam0", frames_of(target, both), target)
+    assert sentence.startswith("cam0, board 1: the corners are those of a MIRRORED")
 
 
 # --- symmetric boards ------------------------------------------------------------------------------------------------
