@@ -64,7 +64,7 @@ def _check_one(where: str, frame: np.ndarray, pixels: np.ndarray, seen: np.ndarr
     if mirrored.sum() > _NEARLY_ALL * views.fits.sum() and views.share >= 0.5:
         return [
             f"{where}: the corners are those of a MIRRORED board: in all views, columns running right and rows running "
-            "up would show it from behind. Where points are only numbered from the top, as OpenCV does, nothing but the "
+            "up would show it from behind. Where points are only numbered from the top, as OpenCV does, only the "
             "target's frame is turned over (its z axis points into the board); were the images themselves mirrored, "
             "undo that. Number the points row by row from the lower LEFT."
         ]

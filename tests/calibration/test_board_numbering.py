@@ -145,8 +145,8 @@ def test_a_fifth_of_the_corners_in_wrong_places_are_no_wrong_numbers(board: Targ
     shifted = pixels + rng.uniform(-35.0, 35.0, pixels.shape) * hit[..., None]
     for sentence in check_board("cam0", frames_of(board, shifted), board):
         assert re.search(r"in [1-7] of 20 views many corners are not", sentence)  # by chance, more than elsewhere
-    with pytest.raises(CalibrationError, match="MIRRORED"):
-        check_board("cam0", frames_of(board, shifted * [1, -1] + [0, SIZE[1]]), board)
+    (sentence,) = check_board("cam0", frames_of(board, shifted * [1, -1] + [0, SIZE[1]]), board)
+    assert "MIRRORED" in sentence
 
 
 def test_each_board_of_a_set_is_checked() -> None:
