@@ -17,7 +17,10 @@ from jaxcal.calibration.generic_lens import Projection
 from jaxcal.calibration.initial_poses import rotations
 
 _FIRST_DAMPING = 1e-3
+_FREE_DAMPING = 1e-9
 _LARGEST_DAMPING = 1e10
+# Keeps what no corner determines from making a matrix singular.
+_ROUNDING = 1e-13
 
 
 @runtime_checkable
@@ -166,7 +169,10 @@ def fit_lenses(
         gram = np.where(better[:, None, None, None], trial, gram)
         cost = np.where(better, trial_cost, cost)
         damping, raise_by = _next_damping(better, damping, raise_by)
-        if np.all((better & (gain < rtol * cost)) | (damping > _LARGEST_DAMPING)):
+        # A small gain under strong damping says nothing: what is weakly determined has hardly moved yet. With the poses
+        # held it had better not move: it would take up their errors.
+        settled = better & (gain < rtol * cost) & (hold_poses | (damping < _FREE_DAMPING))
+        if np.all(settled | (damping > _LARGEST_DAMPING)):
             break
     return Fit(parameters, rotation, translation, cost)
 
@@ -234,9 +240,12 @@ def _linearise(
 
 
 def _damped(block: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """A normal matrix with its diagonal raised by a share of itself, and never singular."""
+    """A normal matrix with its diagonal raised by a share of itself, and never singular.
+
+    Each parameter by its own diagonal: their units differ by ten orders of magnitude.
+    """
     diagonal = np.diagonal(block, axis1=-2, axis2=-1)
-    added = damping[..., None] * diagonal + 1e-14 * diagonal.max(axis=-1, keepdims=True) + 1e-12
+    added = np.where(diagonal > 0, (damping[..., None] + _ROUNDING) * diagonal, 1.0)
     return block + added[..., None] * np.eye(block.shape[-1])
 
 
@@ -259,7 +268,6 @@ def _schur_step(
     cross = gram[..., :6, 6:-1]
     reduction = np.sum(cross.swapaxes(-1, -2) @ eliminated, axis=1)
     schur = corner - reduction[..., :-1]
-    schur = schur + 1e-14 * np.diagonal(corner, axis1=-2, axis2=-1).max() * np.eye(schur.shape[-1])
     step = -np.linalg.solve(schur, (gradient - reduction[..., -1])[..., None])[..., 0]
     poses = -eliminated[..., -1] - np.einsum("bfij,bj->bfi", eliminated[..., :-1], step)
     return step, poses

@@ -51,9 +51,8 @@ def _chunks(rows: np.ndarray, fill: float) -> list[np.ndarray]:
     return np.split(padded, max(len(padded) // _CHUNK, 1))
 
 
-def _point(template: CameraModel, parameters: Array, point: Array) -> tuple[Array, Array]:
-    model = template.with_parameters(parameters)
-    return model.project(point), jnp.asarray(model.is_valid(point))
+def _pixel(template: CameraModel, parameters: Array, point: Array) -> Array:
+    return template.with_parameters(parameters).project(point)
 
 
 @eqx.filter_jit
@@ -61,9 +60,8 @@ def _with_lens(template: CameraModel, parameters: Array, points: Array) -> tuple
     """Pixels (2, M), Jacobian by the point (2, 3, M), validity (M), Jacobian by the lens (n, 2, M); all finite."""
 
     def one(point: Array) -> tuple[Array, Array, Array, Array]:
-        pixel, valid = _point(template, parameters, point)
-        by_lens, by_point = jax.jacrev(lambda *at: _point(template, *at)[0], argnums=(0, 1))(parameters, point)
-        return _finite(pixel, by_point, valid, by_lens.T)
+        by_lens, by_point = jax.jacrev(lambda *at: _pixel(template, *at), argnums=(0, 1))(parameters, point)
+        return _finite(_pixel(template, parameters, point), by_point, by_lens.T)
 
     return jax.vmap(one, out_axes=-1)(points)
 
@@ -73,15 +71,17 @@ def _without_lens(template: CameraModel, parameters: Array, points: Array) -> tu
     """As `_with_lens`, less the Jacobian by the lens."""
 
     def one(point: Array) -> tuple[Array, Array, Array]:
-        pixel, valid = _point(template, parameters, point)
-        by_point = jax.jacrev(lambda at: _point(template, parameters, at)[0])(point)
-        return _finite(pixel, by_point, valid, jnp.zeros(0))[:3]
+        by_point = jax.jacrev(lambda at: _pixel(template, parameters, at))(point)
+        return _finite(_pixel(template, parameters, point), by_point, jnp.zeros(0))[:3]
 
     return jax.vmap(one, out_axes=-1)(points)
 
 
-def _finite(pixel: Array, by_point: Array, valid: Array, by_lens: Array) -> tuple[Array, Array, Array, Array]:
-    """The same with zeros for what is not finite, which is then not valid either."""
+def _finite(pixel: Array, by_point: Array, by_lens: Array) -> tuple[Array, Array, Array, Array]:
+    """The same, and whether all is finite; zeros where it is not."""
+    # Whether the point lies in the model's domain is not asked: outside, models give pixels far away, and a domain that
+    # ends where the coefficients say would be a wall in the way of the optimisation.
+    valid = jnp.array(True)
     for part in (pixel, by_point, by_lens):
         valid = valid & jnp.all(jnp.isfinite(part))
     return jnp.where(valid, pixel, 0.0), jnp.where(valid, by_point, 0.0), valid, jnp.where(valid, by_lens, 0.0)
