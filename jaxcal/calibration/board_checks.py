@@ -161,21 +161,30 @@ def _judge(pixels: np.ndarray, seen: np.ndarray, layout: np.ndarray) -> _Views:
     middles = np.unique(np.linspace(0, len(layout) - 1, _PLACES + 2).round().astype(int)[1:-1])
     distance = np.linalg.norm(layout[middles, None] - layout[None], axis=-1)
     near = np.argsort(distance, axis=1, kind="stable")[:, : min(_NEIGHBOURS, len(layout))]
-    misfit, mirrored = _fit(layout[near][None], pixels[:, near], seen[:, near])
+    misfit, mirrored = _fit(layout[near][None], pixels[:, near], seen[:, near], rounds=1)
+    doubtful = _median(misfit) >= _FITS
+    if doubtful.any():
+        some = pixels[doubtful][:, near], seen[doubtful][:, near]
+        misfit[doubtful], mirrored[doubtful] = _fit(layout[near][None], *some, rounds=_ROUNDS)
     usable = np.isfinite(misfit)
     judged = np.any(usable, axis=1, keepdims=True)[:, 0]
-    typical = np.ma.median(np.ma.masked_invalid(misfit), axis=1).filled(np.inf)
+    typical = _median(misfit)
     votes = np.where(usable, np.where(mirrored, 1, -1), 0).sum(axis=1)
     return _Views(judged, judged & (typical < _FITS), votes > 0)
 
 
-def _fit(board: np.ndarray, pixels: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _median(misfit: np.ndarray) -> np.ndarray:
+    """Median (F,) over the places of each view (F, P) that have a misfit; infinite where none has."""
+    return np.ma.median(np.ma.masked_invalid(misfit), axis=1).filled(np.inf)
+
+
+def _fit(board: np.ndarray, pixels: np.ndarray, seen: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
     """Homographies from `board` (1, P, K, 2) to `pixels` (F, P, K, 2) where `seen` (F, P, K).
 
     Returns the misfit (F, P) of all but the worst corners as a share of the neighbourhood's size, NaN where too few are
     seen or they lie in a line, and whether the map turns right hands into left ones, that is, shows the board from
-    behind (image y runs down, board y up). Direct linear transform, as in Hartley & Zisserman, algorithm 4.2, repeated
-    with Cauchy weights, so that single corners in the wrong place do not count.
+    behind (image y runs down, board y up). Direct linear transform, as in Hartley & Zisserman, algorithm 4.2; in
+    further rounds with Cauchy weights, so that single corners in the wrong place do not count.
     """
     weight = seen.astype(np.float64)[..., None]
     count = np.maximum(weight.sum(axis=2, keepdims=True), 1.0)
@@ -188,7 +197,7 @@ def _fit(board: np.ndarray, pixels: np.ndarray, seen: np.ndarray) -> tuple[np.nd
     rows_v = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=-1)
     system = np.einsum("fpki,fpkj->fpkij", rows_u, rows_u) + np.einsum("fpki,fpkj->fpkij", rows_v, rows_v)
     trust, homography, error = weight[..., 0], np.eye(3), weight[..., 0]
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         _, vectors = np.linalg.eigh(np.einsum("fpk,fpkij->fpij", trust, system))
         homography = vectors[..., 0].reshape(*vectors.shape[:2], 3, 3)
         mapped = np.einsum("fpij,fpkj->fpki", homography, np.stack([x, y, one], axis=-1))
