@@ -77,7 +77,7 @@ def initial_lens(name: str, model: type[CameraModel], frames: CameraFrames, targ
                 "and orientation, and that the corners' indices are those of this target."
             )
         lens, rms_px = _requested(model, candidates, views, size)
-    if rms_px > max(0.01 * max(size), 5.0 * best.rms_px):
+    if rms_px > max(0.004 * max(size), 8.0 * best.rms_px):
         seen = generic_lens.half_field_of_view(
             best.fit.parameters[0], views.pixels[best.good][views.weight[best.good] > 0]
         )
@@ -325,29 +325,42 @@ def _requested(
 ) -> tuple[CameraModel, float]:
     """The requested model fitted to the generic lens' views, from several starts while it is worse than that lens."""
     far = float(max(size))
-    best: tuple[float, float, CameraModel] | None = None
+    best: tuple[Fit, Views, CameraModel] | None = None
     for found in candidates:
         focal = float(np.exp(found.fit.parameters[0, 0]))
         kept = views.with_weight(views.weight * found.good[:, None])
         for factor in _FOCAL_FACTORS:
             for start in model.starts(focal * factor, size):
                 fit = _fit_model(start, found.fit, kept, far)
-                rms_px = _trimmed_rms(ModelLens(start), fit, kept, far)
-                logger.debug("%s: %.3f px, cost %.6g, %s", model.name, rms_px, fit.cost[0], fit.parameters[0])
-                if best is None or fit.cost[0] < best[0]:
-                    best = (float(fit.cost[0]), rms_px, start.with_parameters(fit.parameters[0]))
-            if best is not None and best[1] < 1.3 * found.rms_px + 0.05:
-                return best[2], best[1]
+                logger.debug("%s: cost %.6g, %s", model.name, fit.cost[0], fit.parameters[0])
+                if best is None or fit.cost[0] < best[0].cost[0]:
+                    best = (fit, kept, start)
+            if best is not None and _trimmed_rms(ModelLens(best[2]), *best[:2], far) < 1.3 * found.rms_px + 0.05:
+                return _sharpened(*best, far)
     assert best is not None
-    return best[2], best[1]
+    return _sharpened(*best, far)
+
+
+def _sharpened(fit: Fit, views: Views, start: CameraModel, far: float) -> tuple[CameraModel, float]:
+    """The fit with a loss as narrow as the corners' own noise, so that wrong corners pull less; and its error, px."""
+    lens = ModelLens(start)
+    median = float(np.sqrt(np.median(squared_errors(lens, fit, views, far)[0][views.weight > 0])))
+    width = float(np.clip(2.5 * median, 0.1, _HUBER_PX))
+    fit = fit_lenses(lens, fit, views, steps=20, width=width, cap=far, prior=_model_prior(start))
+    return start.with_parameters(fit.parameters[0]), _trimmed_rms(lens, fit, views, far)
+
+
+def _model_prior(start: CameraModel) -> tuple[np.ndarray, np.ndarray]:
+    """The model's own regularisation, and what it holds."""
+    information = np.array(start.regularisation())
+    information[list(start.held)] = _HELD
+    return np.asarray(start.parameters), information
 
 
 def _fit_model(start: CameraModel, generic: Fit, views: Views, far: float) -> Fit:
     """The lens alone on the generic lens' poses, ever more of the image with it, then everything together."""
     lens = ModelLens(start)
-    information = np.array(start.regularisation())
-    information[list(start.held)] = _HELD
-    prior = (np.asarray(start.parameters), information)
+    prior = _model_prior(start)
     fit = Fit(np.asarray(start.parameters)[None], generic.rotation, generic.translation, np.array([np.inf]))
     for cap in (0.05 * far, 0.25 * far, far):
         fit = fit_lenses(lens, fit, views, steps=15, width=0.02 * far, cap=cap, prior=prior, hold_poses=True, rtol=1e-2)
