@@ -157,15 +157,18 @@ class CameraModel(eqx.Module):
     def unproject(self, pixel: Any) -> Float[Array, "*batch 3"]:
         """Rays (..., 3) of unit length through pixels (..., 2): Gauss-Newton on `project`, on the unit sphere.
 
-        Where a pixel belongs to no point the ray of a pixel close to it comes back. Derivatives by pixel and by
-        parameters are those of the implicit function. Raises CalibrationError when the last axis is not 2.
+        Where a lens folds the image, the ray nearer to the axis is found; where a pixel belongs to no point, some ray.
+        Derivatives by pixel and by parameters are those of the implicit function.
+
+        Raises CalibrationError when the last axis is not 2.
         """
         return _batched(_unproject, 2)(self, pixel)
 
 
 @eqx.filter_jit
 def _unproject(model: CameraModel, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
-    fixed = jax.tree.map(jax.lax.stop_gradient, model)
+    numbers, rest = eqx.partition(model, eqx.is_inexact_array)
+    fixed = eqx.combine(jax.lax.stop_gradient(numbers), rest)
     wanted = jax.lax.stop_gradient(pixel)
     ray = jax.lax.fori_loop(0, _UNPROJECT_STEPS, lambda _, ray: _closer(fixed, wanted, ray), _start(fixed, wanted))
     # One undamped step more: it carries the derivatives, which are then those of the implicit function.
