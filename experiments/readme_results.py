@@ -1,35 +1,62 @@
-"""Write the README's table of results: run the built-in rig and the README's two real rigs, and fill in what came out.
+"""Write the README's tables: run the built-in rig, the README's two real rigs, the cameras alone, the benchmarks.
 
     JAXCAL_DATA=path/to/recordings python experiments/readme_results.py
+    JAXCAL_DATA=path/to/recordings python experiments/readme_results.py --only cameras speed
 
-Runs take minutes each; what is cached (recordings, frames, corners) is not made again.
+Runs take minutes each; what is cached (recordings, frames, corners) is not made again. 'robust' fills in the table that
+`experiments/stress_initialisation.py` wrote (`--stress`), and runs nothing itself.
 """
 
 import argparse
 import os
 import re
+import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import platformdirs
 
 import jaxcal
 from jaxcal.pipeline import run_pipeline
+from jaxcal.recording.tables import load_detections
 from jaxcal.results.ground_truth import compare_with_ground_truth
 from jaxcal.simulation import paper_rig, write_recording
 
+SECTIONS = ("results", "cameras", "speed", "robust")
 README = Path(__file__).resolve().parent.parent / "README.md"
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.parse_args()
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=SECTIONS, help="tables to write (default: all)")
+    parser.add_argument("--stress", type=Path, help="table of stress_initialisation.py, for the table 'robust'")
+    chosen = parser.parse_args()
     if "JAXCAL_DATA" not in os.environ:
         print("error: set JAXCAL_DATA to the folder of real recordings.", file=sys.stderr)
         return 1
+    for section in chosen.only:
+        if section == "robust" and chosen.stress is None:
+            continue
+        makers = {
+            "results": rig_table,
+            "cameras": camera_table,
+            "speed": speed_table,
+            "robust": lambda: chosen.stress.read_text().strip(),
+        }
+        block = makers[section]()
+        filled = f"<!-- {section} -->\n{block}\n<!-- /{section} -->"
+        pattern = rf"<!-- {section} -->.*<!-- /{section} -->"
+        README.write_text(re.sub(pattern, lambda _, filled=filled: filled, README.read_text(), flags=re.S))
+        print(block)
+    return 0
+
+
+def rig_table() -> str:
+    """Rigs with an IMU, through the pipeline."""
     text = README.read_text()
     rows = [
         "| rig | camera | fx, fy, cx, cy (px) | reprojection error (px rms) | time offset (ms) | time of the run (s) |",
@@ -49,11 +76,66 @@ def main() -> int:
             calibrations[name] = run_pipeline(rig, Path(folder) / f"out-{name}")
             rows += rows_of(name, calibrations[name], time.monotonic() - start)
         truth = truth_sentence(calibrations["built-in"], built_in.parent / "ground_truth.yaml")
-    block = "\n".join([*rows, "", truth])
-    filled = f"<!-- results -->\n{block}\n<!-- /results -->"
-    README.write_text(re.sub(r"<!-- results -->.*<!-- /results -->", lambda _: filled, text, flags=re.S))
-    print(block)
-    return 0
+    return "\n".join([*rows, "", truth])
+
+
+def camera_table() -> str:
+    """Real cameras without an IMU: a 24 Mpx fisheye by several models, EuRoC's stereo pair, OpenCV's sample."""
+    data = Path(os.environ["JAXCAL_DATA"])
+    rows = [
+        "| recording | model | fx, fy, cx, cy (px) | rms of a coordinate (px) | left out | time (s) |",
+        "|---|---|---|---|---|---|",
+    ]
+    board, detections = fisheye(data / "real_fisheye_24mp" / "observations.npz")
+    for model, warp in (("pinhole-equi", True), ("pinhole-rational8", False), ("pinhole-rational8", True)):
+        name = f"{model}{', board warp' if warp else ''}"
+        rows += camera_rows("24 Mpx fisheye (mrcal)", name, [detections], board, [model], board_warp=warp)
+    grid = jaxcal.AprilGrid(rows=6, cols=6, tag_size=0.088, tag_spacing=0.3)
+    table = data / "euroc_imu_april" / "observations.npz"
+    pair = [load_detections(table, grid, (752, 480), name) for name in ("cam0", "cam1")]
+    rows += camera_rows("EuRoC stereo", "pinhole-radtan", pair, grid, None)
+    images = [
+        cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted((data / "opencv_stereo").glob("left*.jpg"))
+    ]
+    frames = jaxcal.Frames(np.arange(len(images)), [np.asarray(image) for image in images], (640, 480))
+    chessboard = jaxcal.Checkerboard(rows=6, cols=9, spacing=1.0)
+    corners = jaxcal.detect(frames, chessboard)
+    rows += camera_rows("OpenCV sample, left", "pinhole-radtan", [corners], chessboard, None)
+    return "\n".join(rows)
+
+
+def fisheye(path: Path) -> tuple[jaxcal.Checkerboard, jaxcal.Detections]:
+    """mrcal's corners; its detector says how well it found each."""
+    with np.load(path) as table:
+        pixels, weight = table["pixels"], table["weight"]
+    pixels, weight = pixels.reshape(len(pixels), -1, 2), weight.reshape(len(weight), -1)
+    frame, point = np.nonzero(weight > 0)
+    times = np.arange(len(pixels)) * 1_000_000_000
+    detections = jaxcal.Detections(times, frame, point, pixels[frame, point], (6016, 4016), weight[frame, point])
+    return jaxcal.Checkerboard(rows=10, cols=10, spacing=0.077), detections
+
+
+def camera_rows(title: str, name: str, detections: list, target: jaxcal.Target, models: list | None, **options) -> list:
+    """One row per camera; the residuals count by the precision that the detector states."""
+    start = time.monotonic()
+    calibration = jaxcal.calibrate_cameras(detections, target, models, **options)
+    seconds = time.monotonic() - start
+    rows = []
+    for camera in calibration.cameras:
+        values, sigmas = np.asarray(camera.model.intrinsics), calibration.std(f"{camera.name}.intrinsics")
+        lens = ", ".join(f"{v:.2f} ± {s:.2f}" for v, s in zip(values, sigmas, strict=True))
+        precision = camera.detections.precision
+        scaled = camera.residuals_px * (1.0 if precision is None else precision[:, None])
+        rms, lost = np.sqrt(np.mean(scaled[camera.used] ** 2)), 100 * (1 - camera.inlier.mean())
+        rows.append(f"| {title} {camera.name} | {name} | {lens} | {rms:.3f} | {lost:.2f} % | {seconds:.1f} |")
+    return rows
+
+
+def speed_table() -> str:
+    """What `bench_cameras.py` prints."""
+    script = Path(__file__).with_name("bench_cameras.py")
+    done = subprocess.run([sys.executable, str(script)], stdout=subprocess.PIPE, text=True, check=True)
+    return done.stdout.strip()
 
 
 def rig_in(text: str, name: str) -> str:
