@@ -58,7 +58,7 @@ def calibration_from(
         names, layout, state, covariance, num_intrinsics, with_imu=imu is not None, with_time=with_time
     )
     poses = split_groups(layout, cameras, [np.asarray(part) for part in camera_poses(fit.problem, state)])
-    T_cam_rig = [transform(np.asarray(R), np.asarray(t)) for R, t in zip(state.R_cam_rig, state.t_cam_rig, strict=True)]
+    T_cam_rig = [transform(R, t) for R, t in zip(np.asarray(state.R_cam_rig), np.asarray(state.t_cam_rig), strict=True)]
     seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]
     results = []
     for c, (name, frames) in enumerate(zip(names, cameras, strict=True)):
@@ -70,13 +70,13 @@ def calibration_from(
                 image_size=frames.detections.image_size,
                 T_cn_cnm1=None if c == 0 else T_cam_rig[c] @ np.linalg.inv(T_cam_rig[c - 1]),
                 T_cam_imu=None if imu is None else T_cam_rig[c],
-                timeshift_cam_imu=None if imu is None else float(state.shift[c]),
+                timeshift_cam_imu=None if imu is None else float(np.asarray(state.shift)[c]),
                 detections=frames.detections,
                 residuals_px=frames.per_corner(errors, np.nan),
                 inlier=frames.per_corner(fit.kept[c], False),
                 corner_sigma_px=fit.sigmas[c],
                 T_cam_target=_per_timestamp(poses[c], frames, usable[c]),
-                timeshift_cam_cam0=float(state.shift[c]) if with_time and imu is None else None,
+                timeshift_cam_cam0=float(np.asarray(state.shift)[c]) if with_time and imu is None else None,
             )
         )
     shape = _target_shape(state, layout)

@@ -4,11 +4,15 @@ import dataclasses
 import logging
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxcal.calibration.assemble import CameraFrames, split_groups
+from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.robust import RobustFit, corner_errors
+from jaxcal.calibration.state import RigState
 from jaxcal.calibration.uncertainty import shared_information
 from jaxcal.estimation import solve
 
@@ -31,7 +35,7 @@ def confirm_optimum(fit: RobustFit, cameras: Sequence[CameraFrames], *, max_step
         away = _displacement(fit, rng)
         if away is None:
             return fit, []
-        start = fit.problem.retract(fit.state, jnp.zeros(fit.problem.free_chain.shape), jnp.asarray(away))
+        start = _moved(fit.problem, fit.state, jnp.asarray(away))
         result = solve(fit.problem, start, max_steps=max_steps)
         before, after = float(fit.result.equations.cost), float(result.equations.cost)
         logger.info("restart %d: cost %.9g, from %.9g", attempt, after, before)
@@ -44,6 +48,11 @@ def confirm_optimum(fit: RobustFit, cameras: Sequence[CameraFrames], *, max_step
         f"Each of {_RESTARTS} restarts found a better solution than the one before: the optimum is not certain. Record "
         "more views, with more varied tilt and distance."
     ]
+
+
+@eqx.filter_jit
+def _moved(problem: RigProblem, state: RigState, shared: Array) -> RigState:
+    return problem.retract(state, jnp.zeros(problem.free_chain.shape), shared)
 
 
 def _another_optimum(before: float, after: float) -> str:

@@ -187,4 +187,4 @@ def camera_model_of(
 ) -> CameraModel:
     """The camera model of one camera at this state."""
     group, place = layout.place(camera)
-    return templates[group].with_parameters(state.lenses[group][place])
+    return templates[group].with_parameters(np.asarray(state.lenses[group])[place])

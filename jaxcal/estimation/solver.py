@@ -22,6 +22,12 @@ _LARGEST_DAMPING = 1e14
 _NO_LIMIT = 10**9
 
 
+@eqx.filter_jit
+def _linearise(problem: BlockArrowProblem, state: State) -> BlockArrow:
+    """Jitted so that it is traced once, although the loop around it is traced several times."""
+    return problem.linearise(state)
+
+
 class _LoopState(eqx.Module):
     first: Bool[Array, ""]
     trial: State
@@ -53,7 +59,7 @@ class BlockArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         self, fn: Any, y: State, args: Any, options: dict[str, Any], f_struct: Any, aux_struct: Any, tags: Any
     ) -> _LoopState:
         problem: BlockArrowProblem = options["problem"]
-        structure = eqx.filter_eval_shape(problem.linearise, y)
+        structure = eqx.filter_eval_shape(_linearise, problem, y)
         equations = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), structure)
         return _LoopState(
             first=jnp.array(True),
@@ -72,7 +78,7 @@ class BlockArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         self, fn: Any, y: State, args: Any, options: dict[str, Any], state: _LoopState, tags: Any
     ) -> tuple[State, _LoopState, Any]:
         problem: BlockArrowProblem = options["problem"]
-        trial_equations = problem.linearise(state.trial)
+        trial_equations = _linearise(problem, state.trial)
         decrease = state.equations.cost - trial_equations.cost
         accept = state.first | (jnp.isfinite(trial_equations.cost) & (decrease > 0))
 
