@@ -1,0 +1,57 @@
+"""A dozen problems of the initialisation's stress test: each reaches the optimum or says that it does not."""
+
+import csv
+import dataclasses
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from jaxcal import Checkerboard
+
+SCRIPT = Path(__file__).resolve().parents[2] / "experiments" / "stress_initialisation.py"
+
+
+@pytest.fixture(scope="module")
+def stress() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("stress_initialisation", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["pinhole-radtan", "pinhole-equi", "eucm-none"])
+def test_random_problems_reach_the_optimum_or_say_so(
+    stress: ModuleType, monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    """One board and one number of views, so that one program serves the problems of a model."""
+    monkeypatch.setattr(stress, "VIEW_COUNTS", (15,))
+    monkeypatch.setattr(stress, "random_board", lambda rng: Checkerboard(6, 8, rng.uniform(0.02, 0.1)))
+    rows = [stress.run_one(7, number, [model]) for number in range(4)]
+    assert all(row.views == 15 and row.model == model for row in rows)
+    assert [row for row in rows if row.outcome == "failure unnoticed"] == []
+    assert sum(row.outcome == "optimum" for row in rows) >= 3
+
+
+def test_the_same_number_gives_the_same_problem_and_the_table_counts_it(stress: ModuleType, tmp_path: Path) -> None:
+    first, second = (stress.random_problem(np.random.default_rng([3, 1]), "pinhole-none") for _ in range(2))
+    np.testing.assert_array_equal(first.frames.pixels, second.frames.pixels)
+    row = stress.Row(1, "pinhole-none", 45.0, 640, 15, 48, 0.1, 0.02, "failure unnoticed", 2.0, 1.0, 0.1, 0.5, "a, b")
+    rows = [row, dataclasses.replace(row, number=2, outcome="optimum", field_deg=185.0)]
+    with (tmp_path / "results.csv").open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow([field.name for field in dataclasses.fields(stress.Row)])
+        writer.writerows(dataclasses.astuple(r) for r in rows)
+    again = stress.read_rows(tmp_path / "results.csv")
+    assert again == rows
+    table = stress.table_of(again)
+    assert "| all | 2 | 1 | 0 | 1 | 0.50 |" in table
+    assert "| 181 to 361 degrees | 1 | 1 | 0 | 0 | 0.50 |" in table
+    assert table.count("- 1: pinhole-none") == 1
