@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration, TargetShape
 from jaxcal.results.files import load_calibration, save_calibration
 from jaxcal.results.kalibr import CamchainCamera, load_camchain
+from jaxcal.results.projection_uncertainty import ProjectionUncertainty, projection_uncertainty
 from jaxcal.results.text import results_text
 from jaxcal.results.verdict import Verdict, judge
 
@@ -16,11 +17,13 @@ __all__ = [
     "CamchainCamera",
     "CameraCalibration",
     "ImuCalibration",
+    "ProjectionUncertainty",
     "TargetShape",
     "Verdict",
     "judge",
     "load_calibration",
     "load_camchain",
+    "projection_uncertainty",
     "results_text",
     "save_calibration",
     "write_report",

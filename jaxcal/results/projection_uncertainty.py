@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
@@ -116,17 +116,16 @@ def projection_covariance(
     chosen = _camera(calibration, camera)
     if range_m is not None and not range_m > 0:
         raise CalibrationError(f"projection uncertainty: range {range_m} m; expected metres above 0, or None.")
-    corners = _corners_in_camera(calibration, chosen)
+    corners, weight = _corners_in_camera(calibration, chosen)
     if len(corners) < _FEWEST_CORNERS:
         raise CalibrationError(
             f"{chosen.name}: {len(corners)} corners with a known pose of the board; projection uncertainty needs "
             f"{_FEWEST_CORNERS} or more. Results of earlier releases hold no poses: calibrate again."
         )
-    blocks = [f"{chosen.name}.{part}" for part in ("intrinsics", "distortion")]
-    known = {name for name, _ in calibration.blocks}
-    if blocks[0] not in known:
+    blocks = _lens_blocks(calibration, chosen)
+    if not blocks:
         raise CalibrationError(f"{chosen.name}: this calibration holds no covariance of the lens. Calibrate again.")
-    lens = calibration.covariance_of(*[block for block in blocks if block in known])
+    lens = calibration.covariance_of(*blocks)
     count = -(-len(corners) // _CORNER_STEP) * _CORNER_STEP
     padded = np.concatenate([corners, np.tile([[0.0, 0.0, 1.0]], (count - len(corners), 1))])
     inverse_range = 0.0 if range_m is None else 1.0 / range_m
@@ -135,7 +134,7 @@ def projection_covariance(
         for part in _sensitivities(
             chosen.model,
             jnp.asarray(padded),
-            jnp.asarray(np.arange(count) < len(corners)),
+            jnp.asarray(np.pad(weight, (0, count - len(corners)))),
             jnp.asarray(pixels, dtype=float),
             jnp.asarray(inverse_range),
         )
@@ -147,10 +146,10 @@ def projection_covariance(
 
 def can_be_told(calibration: Calibration, camera: CameraCalibration) -> bool:
     """Whether projection uncertainty can be stated: there is a covariance, and corners with poses."""
-    known = any(name == f"{camera.name}.intrinsics" for name, _ in calibration.blocks)
     parameters = np.asarray(camera.model.parameters)
     sound = bool(np.isfinite(parameters).all() and np.isfinite(calibration.covariance).all())
-    return known and sound and len(_corners_in_camera(calibration, camera)) >= _FEWEST_CORNERS
+    known = bool(_lens_blocks(calibration, camera))
+    return known and sound and len(_corners_in_camera(calibration, camera)[0]) >= _FEWEST_CORNERS
 
 
 def implied_motion(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -167,22 +166,23 @@ def implied_motion(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
 def _sensitivities(
     model: CameraModel,
     corners: Float[Array, "M 3"],
-    used: Bool[Array, " M"],
+    weight: Float[Array, " M"],
     pixels: Float[Array, "K 2"],
     inverse_range: Float[Array, ""],
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Over the corners: sum B'B (6, 6) and sum B'A (6, n); at the pixels: A (K, 2, n), B (K, 2, 6), and whether the
-    pixel has a ray (K,)."""
+    """Weighted sums over the corners: B'B (6, 6) and B'A (6, n); at the pixels: A (K, 2, n), B (K, 2, 6), and whether
+    the pixel has a ray (K,)."""
     parameters = model.parameters
 
     def project(vector: Array, point: Array) -> Array:
         return model.with_parameters(vector).project(point)
 
-    B = jax.vmap(lambda point: _pose_jacobian(model, point, jnp.asarray(1.0)))(corners) * used[:, None, None]
-    normal = jnp.einsum("mik,mil->kl", B, B)
+    B = jax.vmap(lambda point: _pose_jacobian(model, point, jnp.asarray(1.0)))(corners)
+    weighted = B * weight[:, None, None]
+    normal = jnp.einsum("mik,mil->kl", weighted, B)
     # B'A without A, which is large for splined lenses: six vector-Jacobian products over all corners at once.
     _, pull = jax.vjp(lambda vector: jax.vmap(lambda point: project(vector, point))(corners), parameters)
-    right = jax.vmap(lambda column: pull(column)[0])(jnp.moveaxis(B, -1, 0))
+    right = jax.vmap(lambda column: pull(column)[0])(jnp.moveaxis(weighted, -1, 0))
     rays = model.unproject(pixels)
     A = jax.vmap(lambda ray: jax.jacrev(project)(parameters, ray))(rays)
     B_there = jax.vmap(lambda ray: _pose_jacobian(model, ray, inverse_range))(rays)
@@ -214,15 +214,26 @@ def _camera(calibration: Calibration, camera: str | int) -> CameraCalibration:
     raise CalibrationError(f"no camera is called '{camera}'. This calibration has: {known}.")
 
 
-def _corners_in_camera(calibration: Calibration, camera: CameraCalibration) -> np.ndarray:
-    """Places (M, 3), m, in the camera's frame of the corners that were used and whose frame has a pose."""
+def _lens_blocks(calibration: Calibration, camera: CameraCalibration) -> list[str]:
+    """The blocks of the covariance that make up the lens; none unless they are all there."""
+    wanted = (f"{camera.name}.intrinsics", f"{camera.name}.distortion")
+    sizes = {name: size for name, size in calibration.blocks if name in wanted}
+    return [name for name in wanted if name in sizes] if sum(sizes.values()) == camera.model.num_parameters else []
+
+
+def _corners_in_camera(calibration: Calibration, camera: CameraCalibration) -> tuple[np.ndarray, np.ndarray]:
+    """Places (M, 3), m, in the camera's frame of the corners that were used and whose frame has a pose, and their
+    relative weights (M,)."""
     if camera.T_cam_target is None:
-        return np.zeros((0, 3))
+        return np.zeros((0, 3)), np.zeros(0)
     used = camera.used
     T = camera.T_cam_target[camera.detections.frame[used]]
     points = calibration.target_points[camera.detections.point[used]]
     places = np.einsum("mij,mj->mi", T[:, :3, :3], points) + T[:, :3, 3]
-    return places[np.isfinite(places).all(axis=1)]
+    precision = camera.detections.precision
+    weight = np.ones(len(places)) if precision is None else precision[used] ** 2
+    known = np.isfinite(places).all(axis=1)
+    return places[known], weight[known]
 
 
 def _worst_sigma(covariance: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 from jaxcal.cameras import model_name
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
 from jaxcal.results.parameters import sigma_of
+from jaxcal.results.projection_uncertainty import can_be_told, projection_uncertainty
 from jaxcal.targets import AprilGrid, Target
 
 
@@ -78,6 +79,12 @@ def _cameras(calibration: Calibration) -> str:
             f"    corners: {int(camera.used.sum())} used of {len(camera.detections)}, "
             f"in {len(camera.detections.seen_frames)} frames",
         ]
+        if can_be_told(calibration, camera):
+            noise = projection_uncertainty(calibration, camera.name)
+            lines.append(
+                f"    projection uncertainty at infinity, 1-sigma [px]: {noise.centre_px:.3g} at the image's centre, "
+                f"{noise.rim_px:.3g} at the rim of the corners, {noise.worst_px:.3g} at worst inside"
+            )
         if camera.timeshift_cam_cam0 is not None:
             sigma = sigma_of(calibration, f"{camera.name}.timeshift_cam_cam0")
             shown = "held" if sigma is None else format(sigma[0], ".3g")

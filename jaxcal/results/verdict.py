@@ -10,6 +10,7 @@ import numpy as np
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
 from jaxcal.results.coverage import coverage, least_kept
 from jaxcal.results.parameters import camera_estimates, sigma_of, timeshift_estimate
+from jaxcal.results.projection_uncertainty import can_be_told, projection_uncertainty
 from jaxcal.results.target_bias import target_bias
 from jaxcal.targets import Target
 
@@ -20,6 +21,7 @@ _RMS_PX = (1.0, 3.0)  # for images up to 2000 px wide; in proportion beyond
 _RMS_OVER_NOISE = (1.5, 4.0)  # 1 when the residuals are Gaussian
 _TARGET_BIAS = 0.4  # share of the corner noise that is the same in every frame
 _FOCAL_SIGMA = (0.005, 0.03)  # relative
+_PROJECTION_PX = (1.0, 5.0)  # for images up to 2000 px wide; in proportion beyond
 _COVERAGE = (0.5, 0.15)
 _INLIERS = (0.9, 0.5)
 _INLIERS_OF_CELL = 0.6
@@ -120,6 +122,7 @@ def _checks(calibration: Calibration) -> Iterator[Check]:
         yield from _target_checks(camera, calibration.target)
         yield from _view_checks(camera)
         yield from _lens_checks(calibration, index)
+        yield from _projection_checks(calibration, camera)
         yield from _pose_checks(calibration, camera)
         yield from _time_checks(calibration, index)
     if calibration.imu is not None:
@@ -264,6 +267,22 @@ def _lens_checks(calibration: Calibration, index: int) -> Iterator[Check]:
             f"{camera.name}'s principal point lies outside its image",
             "Record tilted views in all parts of the image, or check the image size.",
         )
+
+
+def _projection_checks(calibration: Calibration, camera: CameraCalibration) -> Iterator[Check]:
+    if not can_be_told(calibration, camera):
+        return
+    found = projection_uncertainty(calibration, camera.name)
+    scale = max(1.0, camera.image_size[0] / 2000.0)
+    yield Check(
+        camera.name,
+        "projection 1-sigma, worst place",
+        f"{found.worst_px:.2f} px (centre {found.centre_px:.2f}, rim {found.rim_px:.2f})",
+        f"under {_PROJECTION_PX[0] * scale:.2g} px",
+        _above(found.worst_px / scale, _PROJECTION_PX),
+        f"{camera.name}'s projections are known to {found.worst_px:.1f} px (1-sigma) only, where corners were seen",
+        "Record more views where the projection uncertainty is large, tilted and at several distances.",
+    )
 
 
 def _pose_checks(calibration: Calibration, camera: CameraCalibration) -> Iterator[Check]:

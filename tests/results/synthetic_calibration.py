@@ -123,8 +123,10 @@ def _camera(
         [-0.28, 0.07, 2e-4, -3e-4],
     )
     rotation, position = _pose_target_imu(times_s)
-    in_imu = np.einsum("fji,fnj->fni", rotation, target.points[None] - position[:, None])
-    in_camera = in_imu @ T_cam_imu[index][:3, :3].T + T_cam_imu[index][:3, 3]
+    T_target_imu = np.tile(np.eye(4), (len(times_s), 1, 1))
+    T_target_imu[:, :3, :3], T_target_imu[:, :3, 3] = rotation, position
+    T_cam_target = T_cam_imu[index] @ np.linalg.inv(T_target_imu)
+    in_camera = np.einsum("fij,nj->fni", T_cam_target[:, :3, :3], target.points) + T_cam_target[:, None, :3, 3]
     exact = np.asarray(model.project(jnp.asarray(in_camera)))
     inside = (exact > 2).all(-1) & (exact < np.array([width - 3, height - 3])).all(-1) & (in_camera[..., 2] > 0.1)
     # A polynomial lens folds far outside its field of view; a detector would not see those points.
@@ -148,6 +150,7 @@ def _camera(
         residuals_px=residuals,
         inlier=~out,
         corner_sigma_px=noise_px,
+        T_cam_target=T_cam_target,
     )
 
 

@@ -23,7 +23,7 @@ from jaxcal.results.report.imu_figures import _envelope
 from jaxcal.results.report.rig_figures import rig_pictures, rig_poses
 
 VOID = {"meta", "link", "br", "hr", "img", "input"}
-CAMERA_FIGURES, IMU_FIGURES = 6, 9
+CAMERA_FIGURES, IMU_FIGURES = 7, 9
 
 
 class Page(HTMLParser):

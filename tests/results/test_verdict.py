@@ -58,6 +58,7 @@ DEFECTS: dict[str, tuple[Callable[[float], Calibration], float, float, str]] = {
     "frames used": (lambda f: with_camera(1, residuals_px=first_frames(int(f))), 6, 2, "frames"),
     "image covered": (lambda f: with_camera(1, detections=shrunk(f)), 0.5, 0.01, "visited only"),
     "focal length 1-sigma": (lambda f: with_sigma("cam1.intrinsics", f), 20.0, 200.0, "focal length"),
+    "projection 1-sigma, worst place": (lambda f: with_sigma("cam1.distortion", f), 20.0, 80.0, "projections"),
     "principal point": (lambda f: with_camera(1, model=shifted(f)), 400.0, 400.0, "principal point"),
     "pose to previous camera, 1-sigma": (lambda f: with_sigma("cam1.T_cn_cnm1", f), 50.0, 5000.0, "pose to previous"),
     "pose to IMU, 1-sigma": (lambda f: with_sigma("cam1.T_cam_imu", f), 40.0, 1000.0, "pose to IMU"),

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.patches import Circle, Rectangle
 
-from jaxcal.results.calibration import CameraCalibration
+from jaxcal.results.calibration import Calibration, CameraCalibration
 from jaxcal.results.coverage import corner_counts, coverage
 from jaxcal.results.report.drawing import (
     ACCENT,
@@ -21,6 +21,7 @@ from jaxcal.results.report.drawing import (
     panel,
     to_svg,
 )
+from jaxcal.results.report.projection_figure import projection_picture
 from jaxcal.results.target_bias import target_bias
 from jaxcal.targets import Target
 
@@ -29,13 +30,14 @@ _FEWEST_FOR_MEAN = 4
 _RADIUS_BINS = 12
 
 
-def camera_pictures(camera: CameraCalibration, target: Target, prefix: str) -> list[Picture]:
+def camera_pictures(calibration: Calibration, camera: CameraCalibration, prefix: str) -> list[Picture]:
     """All figures of a camera, in the order in which they are read; `prefix` is unique in the page."""
     return [
         _coverage_picture(camera, f"{prefix}-coverage"),
+        projection_picture(calibration, camera, f"{prefix}-projection"),
         _scatter_picture(camera, f"{prefix}-scatter"),
         _field_picture(camera, f"{prefix}-field"),
-        _target_picture(camera, target, f"{prefix}-target"),
+        _target_picture(camera, calibration.target, f"{prefix}-target"),
         _radial_picture(camera, f"{prefix}-radial"),
         _frames_picture(camera, f"{prefix}-frames"),
     ]

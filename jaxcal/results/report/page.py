@@ -46,7 +46,7 @@ def write_report(
                 "id": f"camera-{index}",
                 "tables": camera_tables(calibration, index),
                 "frames": frames,
-                "pictures": camera_pictures(camera, calibration.target, f"c{index}"),
+                "pictures": camera_pictures(calibration, camera, f"c{index}"),
             }
         )
         progress(stage, index + 1, total)
