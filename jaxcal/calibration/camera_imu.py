@@ -66,6 +66,10 @@ def calibrate_camera_imu(
     """
     if spline_order not in (4, 5, 6):
         raise CalibrationError(f"spline_order is {spline_order}; expected 4, 5 or 6.")
+    if len(target.boards) > 1:
+        raise CalibrationError(
+            f"the target has {len(target.boards)} boards; calibrate with one (with an IMU)."
+        )
     if intrinsics != "free" and cameras is None:
         raise CalibrationError(f"intrinsics='{intrinsics}' needs `cameras`, the calibration that they come from.")
     names = resolve_names(detections, names)

@@ -36,6 +36,10 @@ class _Size(click.ParamType):
 @click.option("--models", multiple=True, help="Lens model; once for all cameras, or once per camera (pinhole-radtan).")
 @click.option("--views", type=int, help="Use only so many views, those that tell most.")
 @click.option("--board-warp", is_flag=True, help="Estimate how the board is bent.")
+@click.option("--point-offsets", type=float, help="Let each point of the board be off its place by about so much; mm.")
+@click.option(
+    "--time-offsets", is_flag=True, help="Cameras are not synchronised: estimate a time offset each (moving pictures)."
+)
 @click.option("--loss", default="huber", show_default=True, help="Robust loss under which outliers are found.")
 @click.option("--resolution", type=_Size(), help="Image size of corner tables that do not hold it.")
 @click.option(
@@ -49,6 +53,8 @@ def calibrate_cameras(
     models: tuple[str, ...],
     views: int | None,
     board_warp: bool,
+    point_offsets: float | None,
+    time_offsets: bool,
     loss: str,
     resolution: tuple[int, int] | None,
     sync_tolerance: float,
@@ -97,6 +103,8 @@ def calibrate_cameras(
             sync_tolerance_s=1e-3 * sync_tolerance,
             views=views,
             board_warp=board_warp,
+            point_offset_sigma_m=None if point_offsets is None else 1e-3 * point_offsets,
+            time_offsets=time_offsets,
             loss=cast("Loss", loss),
             progress=bars,
         )

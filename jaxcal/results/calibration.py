@@ -51,9 +51,9 @@ class CameraCalibration:
     measurement for each corner of `detections`, NaN where the corner took no part (frame outside the IMU's time,
     say); `inlier` (M,) is False for corners that were rejected. `corner_sigma_px` is the noise of one corner
     coordinate (of precision 1), estimated from the residuals; `reprojection_rms_px` the root mean square 2-D error of
-    the inliers. `T_cam_target` (T, 4, 4) is the target's pose in the camera's frame for each of the detections' timestamps, NaN
-    where it was not estimated. `timeshift_cam_cam0` (s, t_cam0 = t_cam + shift) where cameras without an IMU were
-    calibrated with a time offset each.
+    the inliers. `T_cam_target` (T, 4, 4) is the target's pose in the camera's frame for each of the detections'
+    timestamps, NaN where it was not estimated. `timeshift_cam_cam0` (s, t_cam0 = t_cam + shift) where cameras without
+    an IMU were calibrated with a time offset each.
     """
 
     name: str
