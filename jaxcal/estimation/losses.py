@@ -75,5 +75,7 @@ def barron(
     if shape == 0.0:
         return 2.0 * width**2 * jnp.log1p(0.5 * ratio), 1.0 / (1.0 + 0.5 * ratio)
     b = abs(shape - 2.0)
-    inner = ratio / b + 1.0
-    return 2.0 * width**2 * b / shape * (inner ** (0.5 * shape) - 1.0), inner ** (0.5 * shape - 1.0)
+    # log1p and expm1: differences of powers near one would drown small residuals in rounding.
+    logarithm = jnp.log1p(ratio / b)
+    rho = 2.0 * width**2 * b / shape * jnp.expm1(0.5 * shape * logarithm)
+    return rho, jnp.exp((0.5 * shape - 1.0) * logarithm)
