@@ -122,8 +122,8 @@ def generic_of(model: CameraModel, image_size: tuple[int, int]) -> np.ndarray:
     """The generic lens (1, 6) nearest to a model over its image: good enough to start poses from, with no unprojection
     of the model's own to compile or to iterate."""
     far = float(max(image_size))
-    angle = np.deg2rad(np.geomspace(0.1, 125.0, 56))
-    around = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    angle = np.deg2rad(np.geomspace(0.2, 125.0, 30))
+    around = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
     rays = np.stack(
         [
             np.sin(angle)[:, None] * np.cos(around),
@@ -250,7 +250,8 @@ def _generic_candidates(frames: CameraFrames, target: Target, views: Views, size
     fit = fit_lenses(
         lens, fit, more, steps=30, width=_loss_width(lens, fit, more, 0.6, far), cap=0.25 * far, prior=prior
     )
-    found = [_extended(lens, fit.parameters[b : b + 1], views, size) for b in range(len(order))]
+    order = _finalists(_score(lens, fit, more, far), fit.parameters)  # some have met
+    found = [_extended(lens, fit.parameters[b : b + 1], views, size) for b in order]
     # Where several explain the views equally well, the prior in their costs decides.
     return sorted(found, key=lambda f: (f.rms_px > 1.5 * min(g.rms_px for g in found), f.cost))
 
