@@ -36,6 +36,14 @@ _NAMED_PART = 0.25
 
 
 @dataclass(frozen=True)
+class Advice:
+    """`sentences` for a person, and whether a lens is not known at all."""
+
+    sentences: tuple[str, ...]
+    lens_unknown: bool
+
+
+@dataclass(frozen=True)
 class _Seen:
     """What one camera saw: per view that takes part, the tilt of the board to the image plane (deg) and the depth (m)
     of its middle; and the corners in the image (M, 2)."""
@@ -78,8 +86,8 @@ def advice(
     T_cam_target: Sequence[np.ndarray],
     target_points: np.ndarray,
     views: Sequence[np.ndarray] | None = None,
-) -> list[str]:
-    """Sentences on what the recording determines badly, which parameters that concerns, and what to record next.
+) -> Advice:
+    """What the recording determines badly, which parameters that concerns, and what to record next.
 
     `covariance` (P, P) of the shared coordinates, of which `free` (P,) are estimated; `kept[c]` (F, N) the corners that
     took part, `T_cam_target[c]` (F, 4, 4), `target_points` (N, 3) m; `views[c]` (F,) the rig's view of each frame, for
@@ -105,7 +113,8 @@ def advice(
     if views is not None:
         sentences += _few_shared_views(names, views, kept)
     rest = [q for q in quantities if not (q.kind == "lens" and q.name.split(" ")[0] in told)]
-    return sentences + _weak_directions(rest, covariance)
+    lost = any(q.kind == "lens" and _sigma(q, covariance) > _UNKNOWN * q.weak for q in quantities)
+    return Advice((*sentences, *_weak_directions(rest, covariance)), lens_unknown=lost)
 
 
 # --- views -----------------------------------------------------------------------------------------------------------

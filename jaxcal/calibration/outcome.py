@@ -11,6 +11,7 @@ from jaxcal.calibration.checks import versions
 from jaxcal.calibration.robust import RobustFit, camera_poses
 from jaxcal.calibration.state import RigState, SharedLayout, camera_model_of, transform
 from jaxcal.cameras import CameraModel
+from jaxcal.errors import CalibrationError
 from jaxcal.results import Calibration, CameraCalibration, ImuCalibration, TargetShape
 from jaxcal.targets import Target
 
@@ -50,7 +51,7 @@ def calibration_from(
     with_time: bool = True,
 ) -> Calibration:
     """Assemble the result; `covariance` (P, P) is that of the shared tangent vector, `with_time` whether time shifts
-    were estimated."""
+    were estimated. Raises CalibrationError when the recording leaves a lens open and no optimum was found."""
     state, layout = fit.state, fit.problem.layout
     models = [camera_model_of(state, layout, fit.problem.templates, c) for c in range(layout.num_cameras)]
     num_intrinsics = [model.num_intrinsics for model in models]
@@ -95,9 +96,15 @@ def calibration_from(
         if fit.problem.order == 1
         else None,
     )
-    sentences = [*open_questions, *warnings, *outliers.rejection_warnings(names, seen, fit.kept)]
+    if open_questions.lens_unknown and not bool(fit.result.converged):
+        # The lens is on its way to infinity, say: neither it nor its sigmas mean anything.
+        raise CalibrationError(
+            "failed, because the recording does not determine the lens, and the optimisation finds no end. "
+            + " ".join(open_questions.sentences)
+        )
+    sentences = [*open_questions.sentences, *warnings, *outliers.rejection_warnings(names, seen, fit.kept)]
     if not bool(fit.result.converged):
-        reason = ", because the recording leaves parameters open" if open_questions else ""
+        reason = ", because the recording leaves parameters open" if open_questions.sentences else ""
         sentences.insert(0, f"The optimisation stopped before it converged{reason}. Do not use this result.")
     history = np.asarray(fit.result.history)
     return Calibration(
