@@ -27,7 +27,7 @@ from jaxcal import Calibration, CameraModel, Detections, Target, calibrate_camer
 from jaxcal.calibration import outliers, solving, uncertainty
 from jaxcal.calibration.assemble import CameraFrames, camera_frames, split_groups, stack_groups
 from jaxcal.calibration.problem import RigProblem
-from jaxcal.calibration.robust import corner_errors
+from jaxcal.calibration.robust import corner_errors, estimated_parameters
 from jaxcal.calibration.state import RigState, camera_model_of
 from jaxcal.estimation import solve
 from jaxcal.results import CameraCalibration
@@ -244,9 +244,10 @@ def _estimated_noise(truth: Truth, problem: RigProblem, state: RigState) -> list
     """Corner noise (px) of each camera from its residuals, as `calibrate_cameras` estimates it."""
     errors = split_groups(problem.layout, truth.frames, [np.asarray(e) for e in corner_errors(problem, state)])
     poses = 6.0 * len(truth.frames[0].frames) / len(truth.frames)
+    parameters = estimated_parameters(problem, [poses] * len(truth.frames))
     return [
-        outliers.rms_sigma(error, frames.seen, size + poses)
-        for error, frames, size in zip(errors, truth.frames, problem.layout.sizes, strict=True)
+        outliers.rms_sigma(error, frames.seen, paid)
+        for error, frames, paid in zip(errors, truth.frames, parameters, strict=True)
     ]
 
 

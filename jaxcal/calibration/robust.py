@@ -103,7 +103,7 @@ def robust_fit(
         if stage == 2:
             kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(scaled, seen, sigmas, strict=True)]
         if stage >= 3:
-            parameters = [n + p for n, p in zip(layout.sizes, pose_parameters, strict=True)]
+            parameters = estimated_parameters(problem, pose_parameters)
             sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(scaled, kept, parameters, strict=True)]
         if stage == 3:
             # Good corners that outliers in the same view had pulled away are taken back.
@@ -118,6 +118,17 @@ def robust_fit(
     progress("optimise", ROUNDS, ROUNDS)
     assert result is not None
     return RobustFit(problem, result, errors, kept, sigmas, redundancy)
+
+
+def estimated_parameters(problem: RigProblem, pose_parameters: Sequence[float]) -> list[float]:
+    """How many parameters each camera's corners pay for: its lens (what of it is free), its place in the rig, its share
+    of what is estimated of the target, and `pose_parameters` of the trajectory."""
+    layout, free = problem.layout, np.asarray(problem.free)
+    of_target = float(free[layout.target].sum()) / layout.num_cameras
+    return [
+        float(free[layout.lens(c)].sum() + free[layout.pose(c)].sum()) + of_target + of_poses
+        for c, of_poses in enumerate(pose_parameters)
+    ]
 
 
 def _with_weights(
