@@ -67,9 +67,7 @@ def calibrate_camera_imu(
     if spline_order not in (4, 5, 6):
         raise CalibrationError(f"spline_order is {spline_order}; expected 4, 5 or 6.")
     if len(target.boards) > 1:
-        raise CalibrationError(
-            f"the target has {len(target.boards)} boards; calibrate with one (with an IMU)."
-        )
+        raise CalibrationError(f"the target has {len(target.boards)} boards; calibrate with one (with an IMU).")
     if intrinsics != "free" and cameras is None:
         raise CalibrationError(f"intrinsics='{intrinsics}' needs `cameras`, the calibration that they come from.")
     names = resolve_names(detections, names)
@@ -212,7 +210,7 @@ def _problem(
     if intrinsics == "held":
         for c in range(layout.num_cameras):
             free[layout.lens(c)] = False
-    prior = solving.lens_prior(lenses, layout)
+    prior = solving.lens_prior(lenses, layout, frames)
     if intrinsics == "prior" and cameras is not None:
         prior = _lens_prior(cameras, layout)
     return RigProblem(

@@ -24,16 +24,26 @@ from jaxcal.targets import Target
 _VIEW_STEP = 8
 
 
-def lens_prior(models: Sequence[CameraModel], layout: SharedLayout) -> LensPrior:
-    """What the models themselves ask for (`CameraModel.regularisation`); nothing for most."""
+def lens_prior(models: Sequence[CameraModel], layout: SharedLayout, cameras: Sequence[CameraFrames]) -> LensPrior:
+    """What is known of any lens beforehand: next to nothing, but enough that nothing runs off to infinity.
+
+    Focal lengths are somewhere about the image's longer side (1-sigma that length), the principal point about its
+    middle (1-sigma half that length): a thousand times wider than what usable views say, and all there is where views
+    tell nothing (all of them frontal). Further parameters as the models ask (`CameraModel.regularisation`).
+    """
+    means, informations = {}, {}
+    for c, model in enumerate(models):
+        width, height = cameras[c].detections.image_size
+        side = float(max(width, height))
+        means[c] = np.asarray(type(model).from_focal(side, (width, height)).parameters)
+        information = np.array(model.regularisation(), dtype=np.float64)
+        for place, name in enumerate(name for part in model.parameter_names for name in part):
+            if name in ("fx", "fy", "cx", "cy"):
+                information[place] += (side if name[0] == "f" else 0.5 * side) ** -2
+        informations[c] = np.diag(information)
     return LensPrior(
-        mean=tuple(
-            jnp.stack([type(models[c]).from_focal(1.0, (2, 2)).parameters for c in members])
-            for members in layout.groups
-        ),
-        information=tuple(
-            jnp.stack([jnp.diag(models[c].regularisation()) for c in members]) for members in layout.groups
-        ),
+        mean=tuple(jnp.asarray(np.stack([means[c] for c in members])) for members in layout.groups),
+        information=tuple(jnp.asarray(np.stack([informations[c] for c in members])) for members in layout.groups),
     )
 
 
@@ -96,7 +106,7 @@ def camera_problem(
         corners=vision_data(layout, cameras, weights=weights, views=views),
         geometry=geometry_of(target) if offset_sigma_m is None else geometry_of(target, offset_sigma_m),
         imu=None,
-        prior=lens_prior(models, layout),
+        prior=lens_prior(models, layout, cameras),
         free_chain=jnp.asarray(free_chain),
         free=jnp.asarray(free),
         loss_width=jnp.asarray(float(loss_width)),

@@ -87,7 +87,7 @@ def continuous_problem(
         corners=vision_data(layout, cameras, weights=[np.ones(f.seen.shape) for f in cameras], times=times),
         geometry=geometry_of(target) if offset_sigma_m is None else geometry_of(target, offset_sigma_m),
         imu=_motion_prior(grid),
-        prior=solving.lens_prior(lenses, layout),
+        prior=solving.lens_prior(lenses, layout, cameras),
         free_chain=jnp.tile(jnp.arange(12) < 6, (knots, 1)),
         free=jnp.asarray(free),
         loss_width=jnp.asarray(1.0),

@@ -127,7 +127,7 @@ def with_imu(seed: int, order: int) -> tuple[RigProblem, RigState]:
         ),
         geometry=geometry_of(BOARD),
         imu=data,
-        prior=solving.lens_prior(LENSES, layout),
+        prior=solving.lens_prior(LENSES, layout, cameras),
         free_chain=jnp.ones((count, 12), dtype=bool),
         free=jnp.ones(layout.size, dtype=bool),
         loss_width=jnp.asarray(jnp.inf),

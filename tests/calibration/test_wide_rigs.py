@@ -19,7 +19,7 @@ from posed_corners import (
 )
 from scipy.spatial.transform import Rotation
 
-from jaxcal import Calibration, CalibrationError, Detections, calibrate_cameras
+from jaxcal import Calibration, CalibrationError, Checkerboard, Detections, calibrate_cameras
 from jaxcal.estimation import LOSSES
 from jaxcal.results import TargetShape, load_calibration
 from jaxcal.targets import AprilGrid, BoardSet
@@ -213,16 +213,18 @@ def test_weak_tilts_end_in_the_optimum_all_the_same() -> None:
 
 @pytest.mark.slow
 def test_the_cost_is_never_above_opencvs_on_the_same_corners() -> None:
+    board = Checkerboard(rows=7, cols=8, spacing=1.0 / 16.0)
     for seed in (21, 22):
-        # OpenCV takes corners in single precision, so both get those.
-        detections = one_camera(seed)
+        # OpenCV takes points and corners in single precision, so both get such.
+        rng = np.random.default_rng(seed)
+        detections = seen(LENS, board_poses(rng, VIEWS, board), board.points, NOISE_PX, rng)
         detections = dataclasses.replace(detections, pixels=detections.pixels.astype(np.float32))
-        camera = calibrate_cameras([detections], BOARD).cameras[0]
+        camera = calibrate_cameras([detections], board).cameras[0]
         used = camera.used
         points, pixels = [], []
         for frame in np.unique(detections.frame[used]):
             rows = used & (detections.frame == frame)
-            points.append(BOARD.points[detections.point[rows]].astype(np.float32)[:, None])
+            points.append(board.points[detections.point[rows]].astype(np.float32)[:, None])
             pixels.append(detections.pixels[rows].astype(np.float32)[:, None])
         theirs, *_ = cv2.calibrateCamera(
             points, pixels, SIZE, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3, criteria=(3, 200, 1e-14)
