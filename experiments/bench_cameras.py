@@ -105,6 +105,10 @@ def make_case(views: int, cameras: int, seed: int = 0) -> Case:
         T_target_rig=(back, -np.einsum("fij,fj->fi", back, T_rig_target[1])),
         loss_width=np.inf,
     )
+    # The others know no prior of the lens.
+    problem = eqx.tree_at(
+        lambda p: p.prior.information, problem, jax.tree.map(jnp.zeros_like, problem.prior.information)
+    )
     return Case(detections, frames, T_cam_rig, T_rig_target, problem, state)
 
 

@@ -15,6 +15,8 @@ from jaxcal.trajectory import PoseSpline, basis_matrix, increments, rotation_at,
 
 # Frames are reduced in batches of this many: large enough to vectorise, small enough to stay in the cache.
 FRAME_BATCH = 16
+# A point that every lens sees, off the axis, where a careless model may have no derivative (m).
+_HARMLESS = (0.1, 0.1, 1.0)
 
 
 class VisionData(eqx.Module):
@@ -215,6 +217,9 @@ def _reduce_corners(
     Corners run along the last axis, which is the one that the compiler vectorises.
     """
     rotated = R_cam_target @ points
+    seen = weight > 0
+    # What is not seen may lie outside the lens's domain, where a projection may be anything; so it is put elsewhere.
+    camera_points = jnp.where(seen, rotated + t_cam_target[:, None], jnp.array(_HARMLESS)[:, None])
 
     def corner(camera_point: Array) -> tuple[Array, tuple[Array, Array], tuple[Array, Array]]:
         def project(camera_point: Array, lens: Array) -> Array:
@@ -224,22 +229,19 @@ def _reduce_corners(
         pixel, pull = jax.vjp(project, camera_point, lens)
         return pixel, pull(jnp.array([1.0, 0.0])), pull(jnp.array([0.0, 1.0]))
 
-    projected, *pulled = jax.vmap(corner, in_axes=1, out_axes=-1)(rotated + t_cam_target[:, None])
+    projected, *pulled = jax.vmap(corner, in_axes=1, out_axes=-1)(camera_points)
     residual = projected - pixels
     rho, robust_weight = loss(weight * jnp.sum(residual**2, axis=0))
-    seen = weight > 0
     root = jnp.sqrt(jnp.where(seen, weight * robust_weight, 0.0))
     x, y, z = rotated
-    gram = jnp.zeros((), dtype=residual.dtype)
+    both = []
     for (by_point, by_lens), error in zip(pulled, residual, strict=True):
         a, b, c = by_point
         by_rotation = jnp.stack([y * c - z * b, z * a - x * c, x * b - y * a])  # -by_point hat(rotated)
         by_shape = jnp.einsum("jn,tjn->tn", R_cam_target.T @ by_point, by_target)
-        rows = jnp.concatenate([by_rotation, by_point, by_lens, by_shape, error[None]])
-        # Not a product with zero: what is not seen may be anything, infinite even.
-        rows = jnp.where(seen, rows * root, 0.0)
-        gram = gram + rows @ rows.T
-    return gram, 0.5 * jnp.sum(jnp.where(seen, rho, 0.0))
+        both.append(jnp.concatenate([by_rotation, by_point, by_lens, by_shape, error[None]]))
+    rows = jnp.concatenate(both, axis=1) * jnp.tile(root, 2)
+    return rows @ rows.T, 0.5 * jnp.sum(jnp.where(seen, rho, 0.0))
 
 
 def _lift(
