@@ -6,7 +6,7 @@ on more views, and the model that was asked for is fitted to the winner and refi
 
 import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from jaxcal.calibration.initial_poses import mirrored_poses, planar_poses
 from jaxcal.calibration.model_lens import ModelLens
 from jaxcal.calibration.redundancy import view_features
 from jaxcal.cameras import CameraModel
+from jaxcal.cameras.refit import fit_rays
 from jaxcal.errors import CalibrationError
 from jaxcal.estimation.threads import single_threaded_blas
 from jaxcal.targets import Target
@@ -37,7 +38,9 @@ _FIRST_NOISE_PX = 0.1
 # Information on parameters that are held: nothing that corners say comes near.
 _HELD = 1e18
 # Focal lengths tried for the requested model, relative to the one found.
-_FOCAL_FACTORS = (1.0, 0.6, 1.7)
+_FOCAL_FACTORS = (0.6, 1.7)
+# The share of the corners that the requested model may lose against the generic lens.
+_LOST = 0.005
 # A view whose median error is this many times that of most views may stand in a wrong pose.
 _SUSPECT = 1.6
 _POSE_STEPS = 12
@@ -328,18 +331,43 @@ def _requested(
     far = float(max(size))
     best: tuple[Fit, Views, CameraModel] | None = None
     for found in candidates:
-        focal = float(np.exp(found.fit.parameters[0, 0]))
         kept = views.with_weight(views.weight * found.good[:, None])
-        for factor in _FOCAL_FACTORS:
-            for start in model.starts(focal * factor, size):
-                fit = _fit_model(start, found.fit, kept, far)
-                logger.debug("%s: cost %.6g, %s", model.name, fit.cost[0], fit.parameters[0])
-                if best is None or fit.cost[0] < best[0].cost[0]:
-                    best = (fit, kept, start)
-            if best is not None and _trimmed_rms(ModelLens(best[2]), *best[:2], far) < 1.3 * found.rms_px + 0.05:
+        for start in _starts(model, found, kept, size):
+            fit = _fit_model(start, found.fit, kept, far)
+            logger.debug("%s: cost %.6g, %s", model.name, fit.cost[0], fit.parameters[0])
+            if best is None or fit.cost[0] < best[0].cost[0]:
+                best = (fit, kept, start)
+            if _as_good(*best, found, far):
                 return _sharpened(*best, far)
     assert best is not None
     return _sharpened(*best, far)
+
+
+def _starts(model: type[CameraModel], found: _Found, views: Views, size: tuple[int, int]) -> Iterator[CameraModel]:
+    """Lenses to start the requested model from: its own for the focal length found, one fitted to the generic lens
+    itself, its own for other focal lengths."""
+    focal = float(np.exp(found.fit.parameters[0, 0]))
+    yield from model.starts(focal, size)
+    rays, exists = generic_lens.unproject(found.fit.parameters, views.pixels)
+    used = (views.weight > 0) & exists[0]
+    try:
+        yield fit_rays(model, rays[0][used], views.pixels[used], size)
+    except CalibrationError as error:
+        logger.debug("%s: %s", model.name, error)
+    for factor in _FOCAL_FACTORS:
+        yield from model.starts(focal * factor, size)
+
+
+def _as_good(fit: Fit, views: Views, start: CameraModel, found: _Found, far: float) -> bool:
+    """Whether a fitted model explains the corners as well as the generic lens does, at the image's rim too."""
+    lens = ModelLens(start)
+    if _trimmed_rms(lens, fit, views, far) >= 1.3 * found.rms_px + 0.05:
+        return False
+    seen = views.weight > 0
+    limit = max(8.0 * found.rms_px, 0.004 * far) ** 2
+    generic = squared_errors(GenericLens(), found.fit, views, far)[0]
+    lost = seen & (generic < limit) & (squared_errors(lens, fit, views, far)[0] > limit)
+    return bool(lost.sum() <= _LOST * seen.sum())
 
 
 def _sharpened(fit: Fit, views: Views, start: CameraModel, far: float) -> tuple[CameraModel, float]:
