@@ -1,8 +1,10 @@
 """Shared fixtures: the real recordings, and loud deselection of their tests where they are absent."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
+import jax
 import pytest
 
 
@@ -42,3 +44,11 @@ def data_folder() -> Path:
     folder = _data_folder()
     assert folder is not None, "tests that use this fixture are marked real_data"
     return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forget_programs() -> Iterator[None]:
+    """Let go of a module's compiled programs: a process that keeps those of all modules runs out of memory maps, and
+    XLA then crashes while it compiles."""
+    yield
+    jax.clear_caches()

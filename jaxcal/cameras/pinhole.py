@@ -11,9 +11,6 @@ from jaxcal.cameras.numerics import at_least, keeps_orientation, length, rises_u
 
 # Closer to the image plane than this angle (rad) nothing is projected: pixels there are a million focal lengths out.
 _RIM = 1e-6
-# 1-sigma of weak priors about zero on coefficients that stand in for others: numerator against denominator, thin prism
-# against tangential distortion, tilt against the principal point. Real lenses stay well within.
-_PRIOR_SIGMAS = {"k4": 10.0, "k5": 10.0, "k6": 10.0, "s": 0.3, "tau": 0.3}
 
 
 class PinholeModel(CameraModel):
@@ -48,12 +45,6 @@ class PinholeModel(CameraModel):
 
         plane = point[:2] / at_least(point[2], _RIM)
         return rises_until(radius, angle, limit=jnp.pi / 2.0 - _RIM) & keeps_orientation(self._distort, plane)
-
-    def regularisation(self) -> Float[Array, " n"]:
-        """A weak prior on what high-order models cannot tell apart; none for the others (`CameraModel`)."""
-        names = ("",) * 4 + (self.distortion_names if "k6" in self.distortion_names else ("",) * len(self.coefficients))
-        sigmas = [_PRIOR_SIGMAS.get(name, _PRIOR_SIGMAS.get(name.rstrip("_xy1234"))) for name in names]
-        return jnp.asarray([0.0 if sigma is None else sigma**-2 for sigma in sigmas])
 
     @classmethod
     def from_focal(cls, focal: float, image_size: tuple[int, int]) -> "CameraModel":
