@@ -213,9 +213,10 @@ def _bench_multiview(case: Case, views: int, ours: Timing) -> None:
     points = [BOARD.points.astype(np.float32)] * views
 
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS
+    multiview: Any = cv2.calibrateMultiview  # its type hints want poses that it makes itself
 
     def call() -> float:
-        rms, *_ = cv2.calibrateMultiview(
+        rms, *_ = multiview(
             points,
             pixels,
             [SIZE] * len(whole),

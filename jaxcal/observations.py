@@ -305,7 +305,7 @@ class Detections:
             point=self.point,
             pixels=self.pixels,
             image_size=np.array(self.image_size),
-            **({} if self.precision is None else {"precision": self.precision}),
+            **({} if self.precision is None else {"precision": self.precision}),  # pyright: ignore[reportArgumentType]
         )
         write_bytes(Path(path), content.getvalue())
 

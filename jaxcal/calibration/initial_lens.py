@@ -332,30 +332,34 @@ def _requested(
     best: tuple[Fit, Views, CameraModel] | None = None
     for found in candidates:
         kept = views.with_weight(views.weight * found.good[:, None])
-        for start in _starts(model, found, kept, size):
-            fit = _fit_model(start, found.fit, kept, far)
-            logger.debug("%s: cost %.6g, %s", model.name, fit.cost[0], fit.parameters[0])
-            if best is None or fit.cost[0] < best[0].cost[0]:
-                best = (fit, kept, start)
-            if _as_good(*best, found, far):
+        for starts in _starts(model, found, kept, size):
+            # All that the model offers: some lenses (near-unified double spheres) have two nearly equal optima.
+            for start in starts:
+                fit = _fit_model(start, found.fit, kept, far)
+                logger.debug("%s: cost %.6g, %s", model.name, fit.cost[0], fit.parameters[0])
+                if best is None or fit.cost[0] < best[0].cost[0]:
+                    best = (fit, kept, start)
+            if best is not None and _as_good(*best, found, far):
                 return _sharpened(*best, far)
     assert best is not None
     return _sharpened(*best, far)
 
 
-def _starts(model: type[CameraModel], found: _Found, views: Views, size: tuple[int, int]) -> Iterator[CameraModel]:
+def _starts(
+    model: type[CameraModel], found: _Found, views: Views, size: tuple[int, int]
+) -> Iterator[Sequence[CameraModel]]:
     """Lenses to start the requested model from: its own for the focal length found, one fitted to the generic lens
     itself, its own for other focal lengths."""
     focal = float(np.exp(found.fit.parameters[0, 0]))
-    yield from model.starts(focal, size)
+    yield model.starts(focal, size)
     rays, exists = generic_lens.unproject(found.fit.parameters, views.pixels)
     used = (views.weight > 0) & exists[0]
     try:
-        yield fit_rays(model, rays[0][used], views.pixels[used], size)
+        yield [fit_rays(model, rays[0][used], views.pixels[used], size)]
     except CalibrationError as error:
         logger.debug("%s: %s", model.name, error)
     for factor in _FOCAL_FACTORS:
-        yield from model.starts(focal * factor, size)
+        yield model.starts(focal * factor, size)
 
 
 def _as_good(fit: Fit, views: Views, start: CameraModel, found: _Found, far: float) -> bool:

@@ -87,7 +87,7 @@ def test_lenses_are_recovered_within_their_sigmas(name: str) -> None:
     values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
     known = values > 1e-9 * values.max()
     distance = np.sum((vectors.T @ (error / sigma))[known] ** 2 / values[known])
-    assert distance < chi2.ppf(0.999, known.sum())
+    assert distance < chi2.ppf(0.9999, known.sum())
 
 
 def difference_px(
