@@ -3,8 +3,7 @@
     JAXCAL_DATA=path/to/recordings python experiments/readme_results.py
     JAXCAL_DATA=path/to/recordings python experiments/readme_results.py --only cameras speed
 
-Runs take minutes each; what is cached (recordings, frames, corners) is not made again. 'robust' fills in the table that
-`experiments/stress_initialisation.py` wrote (`--stress`), and runs nothing itself.
+Runs take minutes each; what is cached (recordings, frames, corners) is not made again.
 """
 
 import argparse
@@ -26,26 +25,22 @@ from jaxcal.recording.tables import load_detections
 from jaxcal.results.ground_truth import compare_with_ground_truth
 from jaxcal.simulation import paper_rig, write_recording
 
-SECTIONS = ("results", "cameras", "speed", "robust")
+SECTIONS = ("results", "cameras", "speed")
 README = Path(__file__).resolve().parent.parent / "README.md"
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=SECTIONS, help="tables to write (default: all)")
-    parser.add_argument("--stress", type=Path, help="table of stress_initialisation.py, for the table 'robust'")
     chosen = parser.parse_args()
     if "JAXCAL_DATA" not in os.environ:
         print("error: set JAXCAL_DATA to the folder of real recordings.", file=sys.stderr)
         return 1
     for section in chosen.only:
-        if section == "robust" and chosen.stress is None:
-            continue
         makers = {
             "results": rig_table,
             "cameras": camera_table,
             "speed": speed_table,
-            "robust": lambda: chosen.stress.read_text().strip(),
         }
         block = makers[section]()
         filled = f"<!-- {section} -->\n{block}\n<!-- /{section} -->"
