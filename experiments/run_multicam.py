@@ -36,9 +36,9 @@ import time
 from pathlib import Path
 
 import platformdirs
-from tqdm import tqdm
 
 import jaxcal
+from jaxcal.cli.progress_bars import ProgressBars
 from jaxcal.pipeline import PipelineSettings, run_pipeline
 
 
@@ -77,7 +77,7 @@ def parse_arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def simulated_rig(recording: Path | None, bars: "ProgressBars") -> Path:
+def simulated_rig(recording: Path | None, bars: ProgressBars) -> Path:
     """The rig.yaml of the built-in rig's recording, simulated unless it is there already."""
     from jaxcal.simulation import paper_rig, write_recording
 
@@ -100,27 +100,6 @@ def print_result(calibration: jaxcal.Calibration, ground_truth: Path, output: Pa
         print(f"warning: {warning}")
     print(f"report: {(output / 'report.html').resolve()}")
     print(f"all results: {output.resolve()}")
-
-
-class ProgressBars:
-    """Progress callbacks as tqdm bars, one per stage; silent where nobody watches a terminal."""
-
-    def __init__(self) -> None:
-        self._bars: dict[str, tqdm] = {}
-        self._silent = not sys.stderr.isatty()
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        if stage not in self._bars:
-            self._bars[stage] = tqdm(desc=stage, total=total, disable=self._silent, leave=True)
-        bar = self._bars[stage]
-        if bar.total != total:
-            bar.reset(total)
-        bar.update(done - bar.n)
-
-    def close(self) -> None:
-        for bar in self._bars.values():
-            bar.close()
-        self._bars.clear()
 
 
 if __name__ == "__main__":

@@ -24,5 +24,10 @@ class ProgressBars:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the bars as they are and start anew."""
         for bar in self._bars.values():
             bar.close()
+        self._bars.clear()
