@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from jaxcal.cameras import model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.results.calibration import Calibration, CameraCalibration
+from jaxcal.results.kalibr import name_of
 from jaxcal.results.parameters import parameter_names, sigma_of
 
 _AXES = ("x", "y", "z")
@@ -113,7 +114,7 @@ def _camera(
 
 
 def _lens(calibration: Calibration, camera: CameraCalibration, truth: Mapping[str, Any]) -> Iterator[Comparison]:
-    if model_name(camera.model) != f"{truth['camera_model']}-{truth['distortion_model']}":
+    if model_name(camera.model) != name_of(str(truth["camera_model"]), str(truth["distortion_model"])):
         return
     names = parameter_names(camera.model)
     parts = (

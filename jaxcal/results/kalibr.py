@@ -16,6 +16,8 @@ from jaxcal.errors import CalibrationError
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
 
 _OWN_DISTORTION = "custom"  # stands where the distortion is part of a 'module:Class' model
+# Kalibr's files spell this distortion out; its command line, and so the names of models here, shorten it.
+_SPELT_OUT = {"equi": "equidistant"}
 _CAMERA_KEYS = (
     "T_cam_imu",
     "T_cn_cnm1",
@@ -42,12 +44,34 @@ class CamchainCamera:
     T_cam_imu: np.ndarray | None
     timeshift_cam_imu: float | None
     overlaps: tuple[int, ...]
+    rostopic: str | None = None
 
 
 def camchain(calibration: Calibration) -> dict[str, Any]:
     """The content of `camchain.yaml` (without an IMU) or `camchain-imucam.yaml`: 'cam0' .. 'camN' to their entries."""
+    return chain_content(camchain_cameras(calibration))
+
+
+def camchain_cameras(calibration: Calibration) -> tuple[CamchainCamera, ...]:
+    """The cameras of a calibration as a camchain describes them."""
     overlaps = camera_overlaps(calibration.cameras)
-    return {f"cam{k}": _camera_entry(camera, overlaps[k]) for k, camera in enumerate(calibration.cameras)}
+    return tuple(
+        CamchainCamera(
+            name=camera.name,
+            model=camera.model,
+            image_size=camera.image_size,
+            T_cn_cnm1=camera.T_cn_cnm1,
+            T_cam_imu=camera.T_cam_imu,
+            timeshift_cam_imu=camera.timeshift_cam_imu,
+            overlaps=tuple(overlaps[k]),
+        )
+        for k, camera in enumerate(calibration.cameras)
+    )
+
+
+def chain_content(cameras: tuple[CamchainCamera, ...]) -> dict[str, Any]:
+    """The content of a camchain: 'cam0' .. 'camN' to their entries."""
+    return {f"cam{k}": _camera_entry(camera) for k, camera in enumerate(cameras)}
 
 
 def model_entry(model: CameraModel) -> dict[str, Any]:
@@ -58,7 +82,7 @@ def model_entry(model: CameraModel) -> dict[str, Any]:
     return {
         "camera_model": projection,
         "distortion_coeffs": np.asarray(model.distortion).tolist(),
-        "distortion_model": distortion,
+        "distortion_model": _SPELT_OUT.get(distortion, distortion),
         "intrinsics": np.asarray(model.intrinsics).tolist(),
     }
 
@@ -68,18 +92,31 @@ def imu_entry(imu: ImuCalibration) -> dict[str, Any]:
     rate = imu.noise.get("update_rate")
     if rate is None:
         rate = 1.0 / float(np.median(np.diff(imu.t_s)))
+    densities = {name: value for name, value in imu.noise.items() if name != "update_rate"}
+    return noise_content(densities, rate)
+
+
+def noise_content(densities: Mapping[str, float], rate: float) -> dict[str, Any]:
+    """The content of Kalibr's resulting `imu.yaml` for densities by Kalibr's names and a sample rate in Hz."""
     entry = {
         "T_i_b": np.eye(4).tolist(),
-        "accelerometer_noise_density": float(imu.noise["accelerometer_noise_density"]),
-        "accelerometer_random_walk": float(imu.noise["accelerometer_random_walk"]),
-        "gyroscope_noise_density": float(imu.noise["gyroscope_noise_density"]),
-        "gyroscope_random_walk": float(imu.noise["gyroscope_random_walk"]),
+        "accelerometer_noise_density": float(densities["accelerometer_noise_density"]),
+        "accelerometer_random_walk": float(densities["accelerometer_random_walk"]),
+        "gyroscope_noise_density": float(densities["gyroscope_noise_density"]),
+        "gyroscope_random_walk": float(densities["gyroscope_random_walk"]),
         "model": "calibrated",
         "rostopic": "/imu0",
         "time_offset": 0.0,
         "update_rate": float(rate),
     }
     return {"imu0": entry}
+
+
+def name_of(projection: str, distortion: str) -> str:
+    """The name of the model that a camchain calls `projection` and `distortion`, such as 'pinhole' and 'radtan'."""
+    if ":" in projection:
+        return projection
+    return f"{projection}-{next((short for short, long in _SPELT_OUT.items() if long == distortion), distortion)}"
 
 
 def to_yaml(content: Mapping[str, Any]) -> str:
@@ -116,24 +153,29 @@ def load_camchain(path: str | Path) -> tuple[CamchainCamera, ...]:
         ) from error
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise CalibrationError(f"{path}: not a yaml file that can be read: {error}") from error
+    return cameras_of_content(content, str(path))
+
+
+def cameras_of_content(content: Any, where: str) -> tuple[CamchainCamera, ...]:
+    """The cameras that the content of a camchain describes; `where` names the file in errors, as `load_camchain`'s."""
     if not isinstance(content, Mapping) or not content:
-        raise CalibrationError(f"{path}: expected a camchain, with a key 'cam0' and one for each further camera.")
+        raise CalibrationError(f"{where}: expected a camchain, with a key 'cam0' and one for each further camera.")
     for key in content:
         if not re.fullmatch(r"cam\d+", str(key)):
-            raise CalibrationError(f"{path}: unknown key '{key}'. A camchain has the keys cam0, cam1, ... only.")
+            raise CalibrationError(f"{where}: unknown key '{key}'. A camchain has the keys cam0, cam1, ... only.")
     ordered = sorted(content, key=lambda key: int(key[3:]))
-    return tuple(_read_camera(str(key), content[key], f"{path}: {key}") for key in ordered)
+    return tuple(_read_camera(str(key), content[key], f"{where}: {key}") for key in ordered)
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
 
 
-def _camera_entry(camera: CameraCalibration, overlaps: list[int]) -> dict[str, Any]:
+def _camera_entry(camera: CamchainCamera) -> dict[str, Any]:
     entry: dict[str, Any] = {
-        "cam_overlaps": overlaps,
+        "cam_overlaps": list(camera.overlaps),
         **model_entry(camera.model),
         "resolution": [int(size) for size in camera.image_size],
-        "rostopic": f"/{camera.name}/image_raw",
+        "rostopic": camera.rostopic or f"/{camera.name}/image_raw",
     }
     if camera.T_cam_imu is not None:
         entry["T_cam_imu"] = np.asarray(camera.T_cam_imu).tolist()
@@ -188,28 +230,29 @@ def _read_camera(name: str, entry: Any, where: str) -> CamchainCamera:
     missing = [key for key in _NEEDED_KEYS if key not in entry]
     if missing:
         raise CalibrationError(f"{where}: '{missing[0]}' is missing. A camera needs {', '.join(_NEEDED_KEYS)}.")
-    width, height = _numbers(entry["resolution"], (2,), f"{where}: resolution")
+    width, height = numbers(entry["resolution"], (2,), f"{where}: resolution")
     shift = entry.get("timeshift_cam_imu")
+    topic = entry.get("rostopic")
     return CamchainCamera(
         name=name,
         model=_read_model(entry, where),
         image_size=(int(width), int(height)),
         T_cn_cnm1=_transform(entry, "T_cn_cnm1", where),
         T_cam_imu=_transform(entry, "T_cam_imu", where),
-        timeshift_cam_imu=None if shift is None else float(_numbers(shift, (), f"{where}: timeshift_cam_imu")),
+        timeshift_cam_imu=None if shift is None else float(numbers(shift, (), f"{where}: timeshift_cam_imu")),
         overlaps=tuple(int(k) for k in entry.get("cam_overlaps") or ()),
+        rostopic=None if topic is None else str(topic),
     )
 
 
 def _read_model(entry: Mapping[str, Any], where: str) -> CameraModel:
     projection, distortion = str(entry["camera_model"]), str(entry["distortion_model"])
-    intrinsics = _numbers(entry["intrinsics"], (-1,), f"{where}: intrinsics")
-    coefficients = _numbers(entry["distortion_coeffs"], (-1,), f"{where}: distortion_coeffs")
+    intrinsics = numbers(entry["intrinsics"], (-1,), f"{where}: intrinsics")
+    coefficients = numbers(entry["distortion_coeffs"], (-1,), f"{where}: distortion_coeffs")
     if distortion == "none" and ":" not in projection:
         coefficients = np.zeros(0)  # Kalibr writes zeros or an empty list here
     try:
-        model = camera_model(projection if ":" in projection else f"{projection}-{distortion}")
-        return model.create(intrinsics, coefficients)
+        return camera_model(name_of(projection, distortion)).create(intrinsics, coefficients)
     except CalibrationError as error:
         raise CalibrationError(f"{where}: {error}") from error
 
@@ -217,17 +260,24 @@ def _read_model(entry: Mapping[str, Any], where: str) -> CameraModel:
 def _transform(entry: Mapping[str, Any], key: str, where: str) -> np.ndarray | None:
     if key not in entry:
         return None
-    matrix = _numbers(entry[key], (4, 4), f"{where}: {key}")
+    return rigid_transform(entry[key], f"{where}: {key}")
+
+
+def rigid_transform(value: Any, where: str) -> np.ndarray:
+    """A (4, 4) matrix from nested lists. Raises CalibrationError unless it is a rotation and a translation."""
+    matrix = numbers(value, (4, 4), where)
     rotation = matrix[:3, :3]
     rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
     if not rigid or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
         raise CalibrationError(
-            f"{where}: {key} is not a rigid transform. Expected a rotation and a translation, with 0 0 0 1 as last row."
+            f"{where} is not a rigid transform. Expected a rotation and a translation, with 0 0 0 1 as last row."
         )
     return matrix
 
 
-def _numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
+def numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """A float array of the shape given (-1: any length). Raises CalibrationError on other shapes and on what is no
+    finite number; `where` names the value."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
