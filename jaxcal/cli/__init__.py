@@ -6,6 +6,7 @@ import click
 
 from jaxcal.cli.calibrate_cameras import calibrate_cameras
 from jaxcal.cli.convert import convert
+from jaxcal.cli.convert_calibration import convert_calibration
 from jaxcal.cli.target import target
 from jaxcal.errors import CalibrationError
 
@@ -45,5 +46,6 @@ def main() -> None:
 
 
 main.add_command(target)
+convert.add_command(convert_calibration)
 main.add_command(convert)
 main.add_command(calibrate_cameras)

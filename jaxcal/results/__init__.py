@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration, TargetShape
 from jaxcal.results.files import load_calibration, save_calibration
+from jaxcal.results.interchange import CalibratedRig, read_calibration, write_calibration
 from jaxcal.results.kalibr import CamchainCamera, load_camchain
 from jaxcal.results.projection_uncertainty import ProjectionUncertainty, projection_uncertainty
 from jaxcal.results.text import results_text
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from jaxcal.results.report import write_report
 
 __all__ = [
+    "CalibratedRig",
     "Calibration",
     "CamchainCamera",
     "CameraCalibration",
@@ -24,8 +26,10 @@ __all__ = [
     "load_calibration",
     "load_camchain",
     "projection_uncertainty",
+    "read_calibration",
     "results_text",
     "save_calibration",
+    "write_calibration",
     "write_report",
 ]
 
