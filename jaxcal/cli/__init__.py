@@ -5,6 +5,7 @@ from typing import Any
 import click
 
 from jaxcal.cli.calibrate_cameras import calibrate_cameras
+from jaxcal.cli.compare import compare
 from jaxcal.cli.convert import convert
 from jaxcal.cli.convert_calibration import convert_calibration
 from jaxcal.cli.target import target
@@ -49,3 +50,4 @@ main.add_command(target)
 convert.add_command(convert_calibration)
 main.add_command(convert)
 main.add_command(calibrate_cameras)
+main.add_command(compare)

@@ -3,8 +3,10 @@
 from typing import TYPE_CHECKING, Any
 
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration, TargetShape
+from jaxcal.results.compare import compare
+from jaxcal.results.difference import RigDifference
 from jaxcal.results.files import load_calibration, save_calibration
-from jaxcal.results.interchange import CalibratedRig, read_calibration, write_calibration
+from jaxcal.results.interchange import CalibratedRig, read_calibration, rig_of, write_calibration
 from jaxcal.results.kalibr import CamchainCamera, load_camchain
 from jaxcal.results.projection_uncertainty import ProjectionUncertainty, projection_uncertainty
 from jaxcal.results.text import results_text
@@ -20,14 +22,17 @@ __all__ = [
     "CameraCalibration",
     "ImuCalibration",
     "ProjectionUncertainty",
+    "RigDifference",
     "TargetShape",
     "Verdict",
+    "compare",
     "judge",
     "load_calibration",
     "load_camchain",
     "projection_uncertainty",
     "read_calibration",
     "results_text",
+    "rig_of",
     "save_calibration",
     "write_calibration",
     "write_report",

@@ -90,9 +90,9 @@ def projection_uncertainty(
     pixels = np.stack([across, down], axis=-1)
     centre = np.array([[(width - 1.0) / 2.0, (height - 1.0) / 2.0]])
     covariance = projection_covariance(calibration, camera, np.concatenate([centre, pixels.reshape(-1, 2)]), range_m)
-    sigma = _worst_sigma(covariance)
+    sigma = worst_sigma(covariance)
     over_image = sigma[1:].reshape(ny, nx)
-    observed = _observed(chosen, grid)
+    observed = observed_region(chosen, grid)
     return ProjectionUncertainty(
         camera=chosen.name,
         range_m=np.inf if range_m is None else float(range_m),
@@ -236,14 +236,14 @@ def _corners_in_camera(calibration: Calibration, camera: CameraCalibration) -> t
     return places[known], weight[known]
 
 
-def _worst_sigma(covariance: np.ndarray) -> np.ndarray:
+def worst_sigma(covariance: np.ndarray) -> np.ndarray:
     """Square root of the larger eigenvalue of covariances (K, 2, 2), in closed form."""
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     return np.sqrt(np.maximum((a + c) / 2.0 + np.hypot((a - c) / 2.0, b), 0.0))
 
 
-def _observed(camera: CameraCalibration, grid: tuple[int, int]) -> np.ndarray:
-    """(ny, nx) True inside the outline of the used corners of some frame."""
+def observed_region(camera: CameraCalibration, grid: tuple[int, int]) -> np.ndarray:
+    """(ny, nx) True inside the outline of the used corners of some frame, for a grid (nx, ny) over the image."""
     mask = np.zeros((grid[1], grid[0]), dtype=np.uint8)
     scale = (np.array(grid) - 1.0) / (np.array(camera.image_size) - 1.0)
     used = camera.used

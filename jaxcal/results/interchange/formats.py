@@ -105,7 +105,7 @@ def read_calibration(path: str | Path) -> CalibratedRig:
     path = Path(path)
     if not path.exists():
         raise CalibrationError(f"{path}: no such file or folder.")
-    if path.suffix == ".npz" or (path / FILE_NAME).is_file():
+    if _is_ours(path):
         return rig_of(load_calibration(path))
     if path.is_dir():
         name, documents = _format_of_folder(path)
@@ -118,6 +118,16 @@ def read_calibration(path: str | Path) -> CalibratedRig:
             f"{', '.join(format.title for format in FORMATS.values())}, and the folders of jaxcal."
         )
     return FORMATS[name].read(documents)
+
+
+def load_calibration_or_rig(path: str | Path) -> Calibration | CalibratedRig:
+    """A calibration of ours with all it knows, or what a file of another tool says. Raises as `read_calibration`."""
+    path = Path(path)
+    return load_calibration(path) if _is_ours(path) else read_calibration(path)
+
+
+def _is_ours(path: Path) -> bool:
+    return path.suffix == ".npz" or (path / FILE_NAME).is_file()
 
 
 def _format(name: str) -> Format:
