@@ -215,8 +215,7 @@ def _write_frames(
 def _frames_key(events: EventFile, ends: np.ndarray, network: Any, settings: PipelineSettings) -> str:
     """A hash of all that the frames depend on: the event file, the windows, the network's weights and the options."""
     digest = hashlib.sha256()
-    stat = events.path.stat()
-    facts = [_FRAMES_VERSION, events.path.name, stat.st_size, stat.st_mtime_ns, events.width, events.height]
+    facts = [_FRAMES_VERSION, *events.fingerprint(), events.width, events.height]
     digest.update(json.dumps([*facts, type(network).__name__, dict(settings.reconstructor)], default=str).encode())
     digest.update(ends.astype(np.int64).tobytes())
     for name, values in sorted(network.state_dict().items()):

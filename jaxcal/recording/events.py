@@ -1,54 +1,47 @@
-"""Event recordings in e2calib's HDF5 layout, read lazily in windows of time."""
+"""Event recordings of any format: opened by content, read lazily in windows of time, checked on the way."""
 
-import contextlib
+import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import Events
-
-_DATASETS = ("x", "y", "p", "t")
-_NS_PER_US = 1000
-# Events per block of the search index. A block is what one look-up reads, 0.5 MB of time stamps.
-_BLOCK = 65_536
+from jaxcal.recording.formats import open_reader
+from jaxcal.recording.formats.contract import EventColumns, EventReader, Triggers, unsorted
+from jaxcal.recording.places import split_place
 
 
 class EventFile:
-    """An event recording: an HDF5 file with the datasets x, y, p and t (whole microseconds) at its root.
+    """An event recording, in any of the formats of `jaxcal.recording.formats`.
 
-    The layout is that of e2calib (Muglikar et al. 2021, "How to calibrate your event camera"). Nothing but the
-    windows asked for is read: the memory in use does not depend on the recording's length. Time is sorted within a
-    valid file; every window that is read is checked, so that reading all windows checks the whole file.
+    `path` is a file, or `FILE:PLACE` with the topic of a bag or the group of an HDF5 file where there are several. The
+    format is found by content. `width`, `height` of the sensor in pixels may be left out where the file tells them, and
+    must agree with it where both are given. Nothing but the windows asked for is kept: the memory in use does not
+    depend on the recording's length. Every event that is read is checked: in order of time, and on the sensor.
 
-    `path` of the file; `width`, `height` of the sensor in pixels; `first_ns`, `last_ns` time of the first and last
-    event in nanoseconds, on the camera's clock. `len()` is the number of events. Use it as a context manager, or call
-    `close()`.
+    Times are nanoseconds on the camera's clock (for bags: ROS time). Formats that can only be decoded from front to
+    back are read through once when `first_ns`, `last_ns` or `len()` is asked for the first time. Use it as a context
+    manager, or call `close()`.
 
-    Raises CalibrationError when the file is missing, truncated, lacks a dataset, or holds no events; while reading,
+    Raises CalibrationError when the file is missing, damaged, of no known format, or holds no events; while reading,
     when time runs backwards or an event lies outside the sensor.
     """
 
-    def __init__(self, path: str | Path, width: int, height: int) -> None:
-        self.path = Path(path)
-        self.width, self.height = int(width), int(height)
-        self._file = _open(self.path)
+    def __init__(self, path: str | Path, width: int | None = None, height: int | None = None) -> None:
+        self.path, self._place = split_place(path)
+        self._reader = open_reader(self.path, self._place)
         try:
-            self._x, self._y, self._p, self._t = _datasets(self._file, self.path)
-            self._length = len(self._t)
-            self._block_starts: dict[int, int] = {}
-            self.first_ns = int(self._read(self._t, 0, 1)[0]) * _NS_PER_US
-            self.last_ns = int(self._read(self._t, self._length - 1, self._length)[0]) * _NS_PER_US
-            if self.last_ns < self.first_ns:
-                raise self._unsorted(self._length - 1)
+            given = None if width is None or height is None else (int(width), int(height))
+            self._size = _size(self._reader, given)
+            self._span: tuple[int, int] | None = None
         except BaseException:
-            self._file.close()
+            self._reader.close()
             raise
 
     def __len__(self) -> int:
-        return self._length
+        return self._reader.count()
 
     def __enter__(self) -> "EventFile":
         return self
@@ -58,11 +51,89 @@ class EventFile:
 
     def close(self) -> None:
         """Close the file; windows cannot be read afterwards."""
-        self._file.close()
+        self._reader.close()
+
+    @property
+    def format(self) -> str:
+        """A short name of the format, for people."""
+        return self._reader.format
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height of the sensor in pixels, given or read from the file; None when neither tells it."""
+        return self._size
+
+    @property
+    def width(self) -> int:
+        """Columns of the sensor."""
+        return self._known_size()[0]
+
+    @property
+    def height(self) -> int:
+        """Rows of the sensor."""
+        return self._known_size()[1]
+
+    @property
+    def first_ns(self) -> int:
+        """Time of the first event."""
+        return self.span()[0]
+
+    @property
+    def last_ns(self) -> int:
+        """Time of the last event."""
+        return self.span()[1]
+
+    def span(self) -> tuple[int, int]:
+        """Time of the first and the last event, in nanoseconds."""
+        if self._span is None:
+            self._span = self._reader.span()
+        return self._span
+
+    def triggers(self) -> Triggers:
+        """Edges on the external trigger inputs; none where the format has no triggers."""
+        return self._reader.triggers()
+
+    def remarks(self) -> list[str]:
+        """What was odd in the part that has been read so far, and how it was handled; sentences for people."""
+        return self._reader.remarks()
+
+    def fingerprint(self) -> tuple[str, int, int]:
+        """Name, size and time of modification (ns): what changes when the recording does. Opens nothing."""
+        files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
+        facts = [os.stat(file) for file in files]
+        name = self.path.name if self._place is None else f"{self.path.name}:{self._place}"
+        return name, sum(fact.st_size for fact in facts), max(fact.st_mtime_ns for fact in facts)
+
+    # --- events ------------------------------------------------------------------------------------------------------
+
+    def columns(self, t0_ns: int | None = None, t1_ns: int | None = None) -> Iterator[EventColumns]:
+        """The events with t0_ns <= t < t1_ns in pieces as the file has them, in order of time.
+
+        The sensor's size need not be known; where it is, events are checked to lie on it.
+        """
+        latest = None
+        for piece in self._reader.read(t0_ns, t1_ns):
+            _check_order(self.path, piece, latest)
+            latest = int(piece.t_ns[-1])
+            piece = _between(piece, t0_ns, t1_ns)
+            if self._size is not None:
+                _check_inside(self.path, piece, self._size)
+            if len(piece):
+                yield piece
+
+    def unchecked_columns(self) -> Iterator[EventColumns]:
+        """All events in pieces as the file has them, in the file's order, whatever that is."""
+        return self._reader.read(None, None)
+
+    def chunks(self, t0_ns: int | None = None, t1_ns: int | None = None) -> Iterator[Events]:
+        """The events with t0_ns <= t < t1_ns in chunks of bounded size, none of them empty."""
+        self._known_size()
+        return (self._events([piece]) for piece in self.columns(t0_ns, t1_ns))
 
     def window(self, t0_ns: int, t1_ns: int) -> Events:
         """The events with t0_ns <= t < t1_ns, in order."""
-        return self._slice(self._first_at_or_after(t0_ns), self._first_at_or_after(t1_ns), t0_ns, t1_ns)
+        self._known_size()
+        return self._events(list(self.columns(t0_ns, t1_ns)) if t1_ns > t0_ns else [])
 
     def windows(self, window_ns: int, start_ns: int | None = None) -> Iterator[tuple[int, Events]]:
         """Consecutive windows of `window_ns` nanoseconds from `start_ns` (default: the first event), as (end, events).
@@ -80,115 +151,87 @@ class EventFile:
 
         The first one starts at `start_ns`, by default at the first event.
         """
-        start = self.first_ns if start_ns is None else int(start_ns)
-        low = 0 if start_ns is None or start <= self.first_ns else self._first_at_or_after(start)
+        self._known_size()
+        # From the file's very start where that is meant, so that each event there is passes the check of its order.
+        from_start = start_ns is None or start_ns <= self.first_ns
+        pieces = self.columns(None if from_start else int(start_ns or 0))
+        waiting: list[EventColumns] = []  # events read, but behind the windows so far
+        end = None
         for end in ends_ns:
-            high = max(low, self._first_at_or_after(end))
-            yield end, self._slice(low, high, start, end)
-            start, low = end, high
-        if start > self.last_ns and low != self._length:
-            raise self._unsorted(low)
+            while not waiting or int(waiting[-1].t_ns[-1]) < end:
+                piece = next(pieces, None)
+                if piece is None:
+                    break
+                waiting.append(piece)
+            inside, waiting = _cut(waiting, int(end))
+            yield int(end), self._events(inside)
+        if end is not None and end > self.last_ns:  # then there is nothing left, if time is in order
+            left = waiting[0] if waiting else next(pieces, None)
+            if left is not None:
+                raise unsorted(self.path, left.start)
 
-    def _slice(self, low: int, high: int, t0_ns: int, t1_ns: int) -> Events:
-        if high <= low:
-            empty = np.empty(0, np.uint16)
-            return Events(np.empty(0, np.int64), empty, empty, np.empty(0, bool), self.width, self.height)
-        t_ns = self._read(self._t, low, high).astype(np.int64) * _NS_PER_US
-        self._check_time(t_ns, low, t0_ns, t1_ns)
-        x, y = self._read(self._x, low, high), self._read(self._y, low, high)
-        outside = (x < 0) | (x >= self.width) | (y < 0) | (y >= self.height)
-        if outside.any():
-            place = int(np.argmax(outside))
+    def _events(self, pieces: list[EventColumns]) -> Events:
+        width, height = self._known_size()
+        if not pieces:
+            nothing = np.empty(0, np.uint16)
+            return Events(np.empty(0, np.int64), nothing, nothing, np.empty(0, bool), width, height)
+        t_ns, x, y, p = (
+            np.concatenate([getattr(piece, name) for piece in pieces]) if len(pieces) > 1 else getattr(pieces[0], name)
+            for name in ("t_ns", "x", "y", "p")
+        )
+        return Events(t_ns, x.astype(np.uint16, copy=False), y.astype(np.uint16, copy=False), p, width, height)
+
+    def _known_size(self) -> tuple[int, int]:
+        if self._size is None:
             raise CalibrationError(
-                f"{self.path}: event {low + place} at (x, y) = ({x[place]}, {y[place]}) lies outside the "
-                f"{self.width}x{self.height} sensor. Check the resolution given for this camera."
+                f"{self.path}: the file ({self.format}) does not tell the sensor's size. Give the resolution: width "
+                "and height in pixels."
             )
-        p = self._read(self._p, low, high) > 0  # 0/1, -1/1 and bool are all in use
-        return Events(t_ns, x.astype(np.uint16), y.astype(np.uint16), p, self.width, self.height)
+        return self._size
 
-    def _check_time(self, t_ns: np.ndarray, low: int, t0_ns: int, t1_ns: int) -> None:
-        backwards = np.flatnonzero(np.diff(t_ns) < 0)
-        outside = np.flatnonzero((t_ns < t0_ns) | (t_ns >= t1_ns))
-        if len(backwards) or len(outside):
-            place = low + int(backwards[0] + 1 if len(backwards) else outside[0])
-            raise self._unsorted(place)
 
-    def _unsorted(self, place: int) -> CalibrationError:
-        return CalibrationError(
-            f"{self.path}: time runs backwards near event {place}. Events must be sorted by time: sort the recording, "
-            "or convert it again."
+def _size(reader: EventReader, given: tuple[int, int] | None) -> tuple[int, int] | None:
+    told = reader.sensor
+    if given is not None and told is not None and given != told:
+        raise CalibrationError(
+            f"{reader.path}: the file says that the sensor has {told[0]}x{told[1]} pixels, but {given[0]}x{given[1]} "
+            "was given. Correct the resolution, or leave it out."
+        )
+    return given or told
+
+
+def _check_order(path: Path, piece: EventColumns, latest: int | None) -> None:
+    if latest is not None and len(piece) and int(piece.t_ns[0]) < latest:
+        raise unsorted(path, piece.start)
+    backwards = piece.t_ns[1:] < piece.t_ns[:-1]
+    if backwards.any():
+        raise unsorted(path, piece.start + int(np.argmax(backwards)) + 1)
+
+
+def _check_inside(path: Path, piece: EventColumns, size: tuple[int, int]) -> None:
+    width, height = size
+    outside = (piece.x >= width) | (piece.y >= height)
+    if piece.x.dtype.kind != "u" or piece.y.dtype.kind != "u":
+        outside |= (piece.x < 0) | (piece.y < 0)
+    if outside.any():
+        place = int(np.argmax(outside))
+        raise CalibrationError(
+            f"{path}: event {piece.start + place} at (x, y) = ({piece.x[place]}, {piece.y[place]}) lies outside the "
+            f"{width}x{height} sensor. Check the resolution given for this camera."
         )
 
-    # --- search over blocks, so that finding a time reads a handful of them ------------------------------------------
 
-    def _first_at_or_after(self, t_ns: int) -> int:
-        """Index of the first event at or after a time; the number of events when there is none."""
-        t_us = -(-int(t_ns) // _NS_PER_US)
-        low, high = 0, -(-self._length // _BLOCK)
-        while low < high:  # the first block that starts at or after t_us
-            middle = (low + high) // 2
-            if self._block_start(middle) < t_us:
-                low = middle + 1
-            else:
-                high = middle
-        if low == 0:
-            return 0
-        start = (low - 1) * _BLOCK
-        block = self._read(self._t, start, min(start + _BLOCK, self._length)).astype(np.int64)
-        return start + int(np.searchsorted(block, t_us, side="left"))
-
-    def _block_start(self, block: int) -> int:
-        if block not in self._block_starts:
-            start = block * _BLOCK
-            self._block_starts[block] = int(self._read(self._t, start, start + 1)[0])
-        return self._block_starts[block]
-
-    def _read(self, dataset: h5py.Dataset, low: int, high: int) -> np.ndarray:
-        with _damage_named(self.path):
-            return np.asarray(dataset[low:high])
+def _between(piece: EventColumns, t0_ns: int | None, t1_ns: int | None) -> EventColumns:
+    low = 0 if t0_ns is None else int(np.searchsorted(piece.t_ns, t0_ns, side="left"))
+    high = len(piece) if t1_ns is None else int(np.searchsorted(piece.t_ns, t1_ns, side="left"))
+    return piece if (low, high) == (0, len(piece)) else piece.part(low, max(low, high))
 
 
-@contextlib.contextmanager
-def _damage_named(path: Path) -> Iterator[None]:
-    """h5py reports a damaged file by OSError, RuntimeError or KeyError, depending on the place."""
-    try:
-        yield
-    except (OSError, RuntimeError, KeyError) as error:
-        raise CalibrationError(
-            f"{path}: the HDF5 file cannot be read ({error}). It is truncated, damaged or no HDF5 file: copy or "
-            "convert the recording again."
-        ) from error
-
-
-def _open(path: Path) -> h5py.File:
-    if not path.is_file():
-        raise CalibrationError(f"{path}: no such event file. Expected an HDF5 file with the datasets x, y, p and t.")
-    with _damage_named(path):
-        return h5py.File(path, "r")
-
-
-def _datasets(file: h5py.File, path: Path) -> list[h5py.Dataset]:
-    with _damage_named(path):
-        found = {name: file[name] for name in _DATASETS if name in file}
-        content = ", ".join(file) or "nothing"
-    datasets = {name: item for name, item in found.items() if isinstance(item, h5py.Dataset)}
-    for name in _DATASETS:
-        if name not in datasets:
-            raise CalibrationError(
-                f"{path}: dataset '{name}' is missing; the file holds {content}. Expected e2calib's layout: x, y, p "
-                "and t (whole microseconds) at the root."
-            )
-    shapes = {name: dataset.shape for name, dataset in datasets.items()}
-    if len(set(shapes.values())) != 1 or len(shapes["t"]) != 1:
-        raise CalibrationError(
-            f"{path}: x, y, p and t must have one entry per event; their shapes are "
-            f"{', '.join(f'{name} {shape}' for name, shape in shapes.items())}. Convert the recording again."
-        )
-    if shapes["t"][0] == 0:
-        raise CalibrationError(f"{path}: there are no events in the file. Was the camera connected while recording?")
-    if datasets["t"].dtype.kind not in "iu":
-        raise CalibrationError(
-            f"{path}: dataset 't' has type {datasets['t'].dtype}; expected whole microseconds (int64). Float seconds "
-            "lose precision: multiply by 1e6, round, and write again."
-        )
-    return [datasets[name] for name in _DATASETS]
+def _cut(pieces: list[EventColumns], end_ns: int) -> tuple[list[EventColumns], list[EventColumns]]:
+    """Pieces in order of time, parted into what lies before a time and what does not."""
+    before, after = [], []
+    for piece in pieces:
+        place = int(np.searchsorted(piece.t_ns, end_ns, side="left"))
+        before += [piece.part(0, place)] if place else []
+        after += [piece.part(place, len(piece))] if place < len(piece) else []
+    return before, after

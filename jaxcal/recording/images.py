@@ -1,4 +1,4 @@
-"""Images with times from folders: EuRoC/ASL, or files named by their time in nanoseconds."""
+"""Images with times: from EuRoC/ASL folders, from files named by their time in nanoseconds, from bags."""
 
 import csv
 from dataclasses import dataclass
@@ -9,10 +9,16 @@ import numpy as np
 
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import Frames
+from jaxcal.recording.bag_images import load_bag_frames
+from jaxcal.recording.bags import is_bag
+from jaxcal.recording.places import split_place
 from jaxcal.recording.yaml_files import located
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
-_EXPECTED = "Expected an EuRoC/ASL folder (data.csv beside data/) or image files named by their time in ns."
+_EXPECTED = (
+    "Expected an EuRoC/ASL folder (data.csv beside data/), image files named by their time in ns, or a bag: "
+    "FILE.bag:/cam0/image_raw."
+)
 
 
 @dataclass(frozen=True)
@@ -72,11 +78,16 @@ def read_grey(path: Path) -> np.ndarray:
 def load_frames(folder: str | Path) -> Frames:
     """The images of one camera with their times, read lazily.
 
-    `folder` is an EuRoC/ASL camera folder (`data.csv` with lines 'time in ns, file name', and `data/`), or a bare
-    folder of images named `<time in ns>.png`. Raises CalibrationError when there are no images, a file that data.csv
-    names is missing, a name is no time, or times do not increase.
+    `folder` is an EuRoC/ASL camera folder (`data.csv` with lines 'time in ns, file name', and `data/`), a bare folder
+    of images named `<time in ns>.png`, or a bag of ROS 1, ROS 2 or mcap: `FILE.bag:/cam0/image_raw`, where the topic
+    may be left out if only one has images. Raises CalibrationError when there are no images, a file that data.csv names
+    is missing, a name is no time, or times do not increase.
     """
-    folder = Path(folder)
+    folder, topic = split_place(folder)
+    if is_bag(folder):
+        return load_bag_frames(folder, topic)
+    if topic is not None and folder.exists():
+        raise CalibrationError(f"{folder}: '{topic}' names a topic, but this is no bag. {_EXPECTED}")
     if not folder.is_dir():
         raise CalibrationError(f"{folder}: no such image folder. {_EXPECTED}")
     listing = folder / "data.csv"

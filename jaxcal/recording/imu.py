@@ -1,4 +1,4 @@
-"""IMU recordings: EuRoC csv and npz tables, with the noise model from Kalibr's imu.yaml."""
+"""IMU recordings: EuRoC csv, npz tables and bags, with the noise model from Kalibr's imu.yaml."""
 
 import warnings
 from collections.abc import Mapping
@@ -9,6 +9,8 @@ import numpy as np
 
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import ImuNoise, ImuRecording
+from jaxcal.recording.bags import Bag, is_bag
+from jaxcal.recording.places import split_place
 from jaxcal.recording.yaml_files import as_mapping, as_positive, check_keys, located, read_mapping
 
 _DENSITIES = (
@@ -26,14 +28,20 @@ def load_imu(noise: str | Path | ImuNoise, data: str | Path) -> ImuRecording:
     """Read what an IMU recorded.
 
     `noise` is a Kalibr imu.yaml (or an ImuNoise); `data` an EuRoC csv (time in ns, gyroscope rad/s, accelerometer
-    m/s^2), or an npz with `imu_ns` (N,), `gyro_rad_s` (N, 3) and `acc_m_s2` (N, 3). Raises CalibrationError when a
-    file is missing or malformed, or the values are not finite or not in order of time.
+    m/s^2), an npz with `imu_ns` (N,), `gyro_rad_s` (N, 3) and `acc_m_s2` (N, 3), or sensor_msgs/Imu in a bag of ROS 1,
+    ROS 2 or mcap: `FILE.bag:/imu`, where the topic may be left out if only one is an IMU's. Raises CalibrationError
+    when a file is missing or malformed, or the values are not finite or not in order of time.
     """
     model = noise if isinstance(noise, ImuNoise) else load_noise(noise)
-    path = Path(data)
-    if not path.is_file():
-        raise CalibrationError(f"{path}: no such IMU file. Expected a csv ({_CSV_COLUMNS}) or an npz table.")
-    times, gyro, accel = _read_npz(path) if path.suffix == ".npz" else _read_csv(path)
+    path, topic = split_place(data)
+    if is_bag(path) and path.exists():
+        times, gyro, accel = _read_bag(path, topic)
+    elif not path.is_file() or topic is not None:
+        raise CalibrationError(
+            f"{Path(data)}: no such IMU file. Expected a csv ({_CSV_COLUMNS}), an npz table or a bag."
+        )
+    else:
+        times, gyro, accel = _read_npz(path) if path.suffix == ".npz" else _read_csv(path)
     with located(str(path)):
         return ImuRecording(times, gyro, accel, model)
 
@@ -56,6 +64,20 @@ def noise_from_yaml(content: Mapping[str, Any], where: str) -> ImuNoise:
     values = {key: as_positive(content[key], f"{where}: {key}") for key in _DENSITIES}
     rate = content.get("update_rate")
     return ImuNoise(update_rate=None if rate is None else as_positive(rate, f"{where}: update_rate"), **values)
+
+
+def _read_bag(path: Path, topic: str | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """sensor_msgs/Imu: header, orientation (4), covariance (9), rate (3), covariance (9), acceleration (3)."""
+    times, gyro, accel = [], [], []
+    with Bag(path) as bag:
+        chosen = bag.choose(topic, ("sensor_msgs/msg/Imu",), "IMU measurements")
+        for _, content in bag.messages(chosen.name):
+            fields = bag.fields(content)
+            times.append(fields.header())
+            values = fields.numbers("d", 28)
+            gyro.append(values[13:16])
+            accel.append(values[25:28])
+    return np.array(times, np.int64), np.array(gyro, np.float64), np.array(accel, np.float64)
 
 
 def _read_csv(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ from jaxcal.observations import Detections, Frames, ImuNoise, ImuRecording
 from jaxcal.recording.events import EventFile
 from jaxcal.recording.images import load_frames
 from jaxcal.recording.imu import load_imu, load_noise, noise_from_yaml
+from jaxcal.recording.places import split_place
 from jaxcal.recording.tables import load_detections
 from jaxcal.recording.yaml_files import as_mapping, as_positive, as_text, check_keys, read_mapping
 from jaxcal.targets import Target, load_target, target_from_yaml
@@ -23,8 +24,9 @@ _CAMERA_KEYS = ("name", "model", *_SOURCES, "resolution", "prefix")
 class RigCamera:
     """One camera of a rig.
 
-    `model` is a camera model's name; exactly one of `events` (HDF5 file), `frames` (folder) and `detections` (npz) is
-    set; `prefix` names the columns of a corner table; `resolution` (width, height) in pixels where rig.yaml gives it.
+    `model` is a camera model's name; exactly one of `events` (a file of any event format), `frames` (a folder, or a
+    topic of a bag) and `detections` (npz) is set; `prefix` names the columns of a corner table; `resolution` (width,
+    height) in pixels where rig.yaml gives it. Event files of some formats tell it themselves.
     """
 
     name: str
@@ -37,9 +39,16 @@ class RigCamera:
 
     def open_events(self) -> EventFile:
         """The camera's event recording."""
-        if self.events is None or self.resolution is None:
+        if self.events is None:
             raise CalibrationError(f"camera '{self.name}' has no event recording.")
-        return EventFile(self.events, *self.resolution)
+        events = EventFile(self.events, *(self.resolution or (None, None)))
+        if events.size is None:
+            events.close()
+            raise CalibrationError(
+                f"{self.events}: the file ({events.format}) does not tell the sensor's size. Give 'resolution: [width, "
+                f"height]' for '{self.name}' in the rig."
+            )
+        return events
 
     def load_frames(self) -> Frames:
         """The camera's images, read lazily."""
@@ -62,7 +71,7 @@ class RigCamera:
 
 @dataclass(frozen=True)
 class RigImu:
-    """The IMU of a rig: `data` is an EuRoC csv or an npz table, `noise` its noise model."""
+    """The IMU of a rig: `data` is an EuRoC csv, an npz table or a topic of a bag, `noise` its noise model."""
 
     data: Path
     noise: ImuNoise
@@ -141,8 +150,6 @@ def _camera(content: Any, folder: Path, where: str) -> RigCamera:
         raise CalibrationError(f"{where}: give exactly one of events, frames and detections; found {found}.")
     source = sources[0]
     resolution = content.get("resolution")
-    if resolution is None and source == "events":
-        raise CalibrationError(f"{where}: an event recording needs the sensor's 'resolution: [width, height]'.")
     if "prefix" in content and source != "detections":
         raise CalibrationError(f"{where}.prefix: only a camera with 'detections' has a prefix.")
     name = as_text(content["name"], f"{where}.name")
@@ -179,7 +186,7 @@ def _reconstruction(content: Any, folder: Path, where: str) -> RigReconstruction
 
 def _existing(content: Any, folder: Path, where: str) -> Path:
     path = folder / Path(os.path.expandvars(as_text(content, where))).expanduser()
-    if not path.exists():
+    if not split_place(path)[0].exists():
         raise CalibrationError(f"{where}: {path} does not exist. Paths are relative to the rig file's folder.")
     return path
 

@@ -117,7 +117,6 @@ def change(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
         ("cameras.0.event", "events.h5", r"rig.yaml: cameras\[0\]: unknown key 'event'. Did you mean 'events'"),
         ("cameras.0.events", None, r"cameras\[0\]: give exactly one of .*; found none"),
         ("cameras.0.frames", "cam1", "found events and frames"),
-        ("cameras.0.resolution", None, r"cameras\[0\]: an event recording needs the sensor's 'resolution"),
         ("cameras.0.resolution", [640], r"cameras\[0\].resolution: expected \[width, height\]"),
         ("cameras.0.resolution", [640, 480.5], "expected .width, height. in pixels"),
         ("cameras.0.name", "a/b", "leave out slashes"),
