@@ -43,6 +43,10 @@ def compare(
         sides = tuple(_Side(rig.cameras[k], item, k) for rig, item, k in zip(rigs, full, pair, strict=True))
         cameras.append(_camera_difference(sides[0], sides[1], ranges_m, grid))
         parameters += list(_parameter_differences(sides[0], sides[1]))
+    if (full[0] is None) != (full[1] is None):
+        notes.append(
+            f"nothing is known of the {'first' if full[0] is None else 'second'}'s uncertainty: sigmas are the other's"
+        )
     if full[0] is not None and full[1] is not None and _share_frames(full[0], full[1]):
         notes.append(
             "both were made from the same frames, so their errors go together: sigmas that combine as if they were "

@@ -47,7 +47,7 @@ def implied_difference(
     `weight` (R, K) multiplies differences, 1 / sigma, 0 or NaN: not to be fitted. With directions alone the move is a
     turn. Ranges of weight zero take no part in the fit but are told.
     """
-    rays, valid = _rays(first, jnp.asarray(pixels))
+    rays, valid = rays_through(first, jnp.asarray(pixels))
     inverse = np.array([0.0 if np.isinf(r) else 1.0 / r for r in ranges_m])
     valid = np.asarray(valid)
     weight = np.where(valid & np.isfinite(weight), weight, 0.0)
@@ -105,7 +105,8 @@ def _fit(at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], free: np.nda
 
 
 @eqx.filter_jit
-def _rays(model: CameraModel, pixels: Float[Array, "K 2"]) -> tuple[Array, Array]:
+def rays_through(model: CameraModel, pixels: Float[Array, "K 2"]) -> tuple[Array, Array]:
+    """Unit rays (K, 3) of a lens through pixels, and whether each is a ray of that pixel in the lens's domain (K,)."""
     rays = model.unproject(pixels)
     missed = jnp.linalg.norm(model.project(rays) - pixels, axis=-1)
     return rays, jax.vmap(model.is_valid)(rays) & (missed < _MISSED_PX)

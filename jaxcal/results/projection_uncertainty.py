@@ -248,8 +248,10 @@ def observed_region(camera: CameraCalibration, grid: tuple[int, int]) -> np.ndar
     scale = (np.array(grid) - 1.0) / (np.array(camera.image_size) - 1.0)
     used = camera.used
     frame, place = camera.detections.frame[used], camera.detections.pixels[used] * scale
-    for k in np.unique(frame):
-        outline = cv2.convexHull(place[frame == k].astype(np.float32)).reshape(-1, 2)
+    # Corners are in order of their frames.
+    starts = np.flatnonzero(np.diff(frame, prepend=-1))
+    for corners in np.split(place.astype(np.float32), starts[1:]) if len(starts) else ():
+        outline = cv2.convexHull(corners).reshape(-1, 2)
         cv2.fillConvexPoly(mask, outline.round().astype(np.int32), 1)
     return mask.astype(bool)
 

@@ -1,5 +1,6 @@
 """Drawing figures that take their colours from the page: matplotlib figures to SVG for use inside HTML."""
 
+import base64
 import io
 import re
 import threading
@@ -10,6 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 # Colours that stand for a CSS variable of the page and are exchanged for it in the SVG, so that one figure serves the
 # light and the dark page. Raster parts cannot do this: they use the fixed colours below, readable on either.
@@ -34,6 +36,7 @@ PANEL = (4.4, 3.3)  # inches; three abreast on a desk, one on a phone
 _FONT_SIZE = 9.0
 _SETTINGS_LOCK = threading.Lock()  # matplotlib's SVG writer reads process-wide settings
 _RASTER_DPI = 180
+_RASTER_COLOURS = 48  # dots of two colours and their blends: a palette is a quarter of the bytes
 
 
 @dataclass(frozen=True)
@@ -129,11 +132,20 @@ def to_svg(figure: Figure, prefix: str) -> str:
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r"data:image/png;base64,([^\"]+)", _smaller, svg)
     svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
     svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg, count=1)
     svg = re.sub(r'\bid="', f'id="{prefix}-', svg)
     svg = svg.replace("url(#", f"url(#{prefix}-").replace('href="#', f'href="#{prefix}-')
     return re.sub(r"#0[0-9a]0[0-9a]0[0-9a]\b", _variable, svg)
+
+
+def _smaller(match: re.Match[str]) -> str:
+    """A picture inside the SVG with a palette."""
+    content = io.BytesIO()
+    image = Image.open(io.BytesIO(base64.b64decode(match.group(1)))).convert("RGBA")
+    image.quantize(_RASTER_COLOURS, method=Image.Quantize.FASTOCTREE).save(content, "png")
+    return "data:image/png;base64," + base64.b64encode(content.getvalue()).decode()
 
 
 def _variable(match: re.Match[str]) -> str:
