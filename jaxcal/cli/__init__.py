@@ -8,6 +8,7 @@ from jaxcal.cli.calibrate_cameras import calibrate_cameras
 from jaxcal.cli.compare import compare
 from jaxcal.cli.convert import convert
 from jaxcal.cli.convert_calibration import convert_calibration
+from jaxcal.cli.info import info
 from jaxcal.cli.target import target
 from jaxcal.errors import CalibrationError
 
@@ -49,5 +50,6 @@ def main() -> None:
 main.add_command(target)
 convert.add_command(convert_calibration)
 main.add_command(convert)
+main.add_command(info)
 main.add_command(calibrate_cameras)
 main.add_command(compare)

@@ -1,13 +1,15 @@
-"""`jaxcal convert`: a calibrated lens in the form of another model."""
+"""`jaxcal convert`: a calibrated lens in the form of another model, an event recording in another format."""
 
 from pathlib import Path
 
 import click
 
+from jaxcal.cli.sizes import Size
+
 
 @click.group()
 def convert() -> None:
-    """Convert results into other forms."""
+    """Convert results and recordings into other forms."""
 
 
 @convert.command()
@@ -56,3 +58,42 @@ def camera(camchain: Path, model: str, cameras: tuple[str, ...], out: Path | Non
     if out is not None:
         write_bytes(out, to_yaml(content).encode())
         click.echo(f"{out}: written")
+
+
+@convert.command()
+@click.argument("source", metavar="IN")
+@click.argument("out", type=click.Path(dir_okay=False, path_type=Path))
+@click.option("--resolution", type=Size(), help="Size of the sensor, where the file does not tell it.")
+@click.option("--sort", "most_late", type=float, help="Sort events that come up to so much too late; ms.")
+def events(source: str, out: Path, resolution: tuple[int, int] | None, most_late: float | None) -> None:
+    """Write an event recording in another format, in little memory however long it is.
+
+    \b
+    jaxcal convert events recording.raw events.h5
+    jaxcal convert events drive.bag:/dvs/events events.h5 --resolution 346x260
+    jaxcal convert events events.h5 events.txt
+    jaxcal convert events shuffled.csv sorted.h5 --sort 100
+
+    IN is any event recording that `jaxcal info` knows. OUT is told by its suffix: .h5 (e2calib's layout: x, y, p and t
+    in microseconds; external triggers are kept), .npz, .txt or .csv (t x y p, t in whole microseconds).
+
+    Events out of order or off the sensor are errors. --sort puts them in order: events of a few milliseconds are held
+    back and sorted by time.
+    """
+    from jaxcal.cli.progress_bars import ProgressBars
+    from jaxcal.errors import CalibrationError
+    from jaxcal.recording import EventFile
+    from jaxcal.recording.event_writers import convert_events
+
+    with ProgressBars() as bars, EventFile(source, *(resolution or (None, None))) as recording:
+        if out.exists() and out.samefile(recording.path):
+            raise CalibrationError(f"{out}: is the recording itself; name another file.")
+        most_late_ns = None if most_late is None else round(most_late * 1e6)
+        count = convert_events(recording, out, most_late_ns=most_late_ns, progress=bars)
+        triggers = 0 if out.suffix.lower() in (".h5", ".hdf5") else len(recording.triggers())
+        remarks = recording.remarks()
+    click.echo(f"{out}: {count:,} events written")
+    for remark in remarks:
+        click.echo(f"note: {remark}")
+    if triggers:
+        click.echo(f"note: {triggers:,} external triggers are not kept in this format; .h5 keeps them")

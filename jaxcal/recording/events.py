@@ -89,6 +89,10 @@ class EventFile:
             self._span = self._reader.span()
         return self._span
 
+    def rough_count(self) -> int:
+        """About how many events there are, without reading the file."""
+        return self._reader.rough_count()
+
     def triggers(self) -> Triggers:
         """Edges on the external trigger inputs; none where the format has no triggers."""
         return self._reader.triggers()
@@ -116,14 +120,19 @@ class EventFile:
             _check_order(self.path, piece, latest)
             latest = int(piece.t_ns[-1])
             piece = _between(piece, t0_ns, t1_ns)
-            if self._size is not None:
-                _check_inside(self.path, piece, self._size)
             if len(piece):
-                yield piece
+                yield from self.checked_pixels([piece])
 
     def unchecked_columns(self) -> Iterator[EventColumns]:
         """All events in pieces as the file has them, in the file's order, whatever that is."""
         return self._reader.read(None, None)
+
+    def checked_pixels(self, pieces: Iterable[EventColumns]) -> Iterator[EventColumns]:
+        """The same pieces; raises CalibrationError at an event off the sensor, where its size is known."""
+        for piece in pieces:
+            if self._size is not None:
+                _check_inside(self.path, piece, self._size)
+            yield piece
 
     def chunks(self, t0_ns: int | None = None, t1_ns: int | None = None) -> Iterator[Events]:
         """The events with t0_ns <= t < t1_ns in chunks of bounded size, none of them empty."""

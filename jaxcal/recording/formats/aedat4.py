@@ -20,6 +20,7 @@ from jaxcal.recording.formats.streams import Block, StreamReader
 _SIGNATURE = b"#!AER-DAT4.0"
 # Packets hold a few thousand events; so many are handed on at a time.
 _EVENTS_PER_BLOCK = 1 << 19
+_BYTES_PER_EVENT = 8  # roughly, compressed
 # Values of a trigger's source: edges and pulses of the external signal.
 _RISING, _FALLING, _PULSE = 1, 2, 3
 # What the package says where a packet ends behind the end of the file.
@@ -35,11 +36,13 @@ def open_aedat4(path: Path, topic: str | None) -> EventReader:
     sensors = {key: (facts["width"], facts["height"]) for key, facts in streams.items() if facts["type"] == "events"}
     stream = _stream(path, topic, sensors, streams)
 
+    rough = path.stat().st_size // _BYTES_PER_EVENT
+
     def remarks(resume: Any) -> list[str]:
         broken_off = resume is not None and resume[1]
         return ["the file breaks off in the middle of a packet: what comes before it is read"] if broken_off else []
 
-    return StreamReader(path, "AEDAT4", sensors[stream], lambda resume: _blocks(path, stream, resume), remarks)
+    return StreamReader(path, "AEDAT4", sensors[stream], lambda resume: _blocks(path, stream, resume), rough, remarks)
 
 
 def _stream(path: Path, wanted: str | None, sensors: Mapping[int, Any], streams: Mapping[int, Any]) -> int:

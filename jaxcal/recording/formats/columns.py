@@ -62,6 +62,10 @@ class ColumnReader:
         """The number of events."""
         return self._columns.length
 
+    def rough_count(self) -> int:
+        """The number of events."""
+        return self._columns.length
+
     def triggers(self) -> Triggers:
         """All external triggers."""
         return self._triggers()

@@ -79,6 +79,10 @@ class EventReader(Protocol):
         """The number of events. May read the whole file once."""
         ...
 
+    def rough_count(self) -> int:
+        """About how many events there are, without reading the file; at least 1."""
+        ...
+
     def read(self, t0_ns: int | None, t1_ns: int | None) -> Iterator[EventColumns]:
         """The events from t0_ns (None: from the start) to t1_ns (None: to the end), in pieces of bounded size.
 

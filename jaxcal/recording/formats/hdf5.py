@@ -106,8 +106,16 @@ def _open_columns(file: h5py.File, path: Path, group: str) -> EventReader:
             # 0/1, -1/1 and bool are all in use.
             return np.asarray(x[low:high]), np.asarray(y[low:high]), np.asarray(p[low:high]) > 0
 
+    def triggers() -> Triggers:  # as jaxcal writes them
+        edges = [file.get(f"triggers/{name}") for name in ("t", "channel", "rising")]
+        if group or not all(isinstance(edge, h5py.Dataset) for edge in edges):
+            return NO_TRIGGERS
+        with _damage_named(path):
+            at_us, channel, rising = (np.asarray(edge) for edge in edges)
+        return Triggers(at_us.astype(np.int64) * _NS_PER_US, channel.astype(np.int64), rising.astype(bool))
+
     columns = Columns(len(t), times, rest, _bracket(file, path, group, offset_us, len(t)))
-    return ColumnReader(path, f"HDF5, events in /{group}", _sensor(file, group), columns, file.close)
+    return ColumnReader(path, f"HDF5, events in /{group}", _sensor(file, group), columns, file.close, triggers)
 
 
 def _datasets(file: h5py.File, path: Path, group: str) -> dict[str, h5py.Dataset]:
@@ -133,6 +141,11 @@ def _datasets(file: h5py.File, path: Path, group: str) -> dict[str, h5py.Dataset
             f"{path}: dataset 't' has type {datasets['t'].dtype}; expected whole microseconds (int64). Float seconds "
             "lose precision: multiply by 1e6, round, and write again."
         )
+    for name in ("x", "y"):
+        if datasets[name].dtype.kind not in "iu":
+            raise CalibrationError(
+                f"{path}: dataset '{name}' has type {datasets[name].dtype}; expected whole pixels. Write it as uint16."
+            )
     return datasets
 
 

@@ -41,9 +41,14 @@ def open_npz(path: Path, topic: str | None) -> EventReader:
             f"{path}: '{names['t']}' has type {headers['t'][1]}; expected whole microseconds (int64). Float seconds "
             "lose precision: multiply by 1e6, round, and write again."
         )
+    for column in ("x", "y"):
+        if headers[column][1].kind not in "iu":
+            raise CalibrationError(
+                f"{path}: '{column}' has type {headers[column][1]}; expected whole pixels. Write it as uint16."
+            )
     unit_ns = 1 if names["t"] == "t_ns" else 1000
     files = {column: members[name] for column, name in names.items()}
-    return StreamReader(path, "npz", sensor, lambda resume: _blocks(path, files, unit_ns, resume))
+    return StreamReader(path, "npz", sensor, lambda resume: _blocks(path, files, unit_ns, resume), lengths["t"][0])
 
 
 def _blocks(path: Path, members: dict[str, str], unit_ns: int, resume: Any) -> Iterator[Block]:

@@ -44,7 +44,8 @@ def open_dat(path: Path, topic: str | None) -> EventReader:
     sensor = None
     if fields.get("Width", "").isdigit() and fields.get("Height", "").isdigit():
         sensor = int(fields["Width"]), int(fields["Height"])
-    return StreamReader(path, "Prophesee DAT", sensor, lambda resume: _blocks(path, body, resume), remarks)
+    count = (path.stat().st_size - body) // _RECORD.itemsize
+    return StreamReader(path, "Prophesee DAT", sensor, lambda resume: _blocks(path, body, resume), count, remarks)
 
 
 def _blocks(path: Path, body: int, resume: Any) -> Iterator[Block]:

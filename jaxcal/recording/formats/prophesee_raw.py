@@ -16,6 +16,9 @@ from jaxcal.recording.formats.streams import Block, StreamReader
 # Bytes that are decoded at a time: some ten million events at most.
 BLOCK_BYTES = 1 << 21
 
+# What an event takes on average, roughly; rates and scenes differ.
+_BYTES_PER_EVENT = {"evt2": 4, "evt21": 3, "evt21-legacy": 3, "evt3": 3}
+
 # Older files name only the system that recorded. Source: OpenEB, psee_raw_file_header.cpp and device_system_id.h.
 _VGA, _HD = (640, 480), (1280, 720)
 _SYSTEM_SENSORS = {
@@ -55,7 +58,8 @@ def open_raw(path: Path, topic: str | None) -> EventReader:
         return found
 
     name = f"Prophesee RAW {header.encoding.upper()}"
-    return StreamReader(path, name, header.sensor, lambda resume: _blocks(path, header, resume), remarks)
+    rough = round((path.stat().st_size - header.body) / _BYTES_PER_EVENT[header.encoding])
+    return StreamReader(path, name, header.sensor, lambda resume: _blocks(path, header, resume), rough, remarks)
 
 
 def _blocks(path: Path, header: RawHeader, resume: Any) -> Iterator[Block]:

@@ -21,6 +21,7 @@ EVENT_TYPES = (*_ARRAYS, _PACKET)
 _EVT = {"evt2": "evt2", "evt21": "evt21", "evt3": "evt3"}
 _MONO = "mono"
 
+_BYTES_PER_EVENT = {True: 3, False: 13}  # of a packet, roughly; of an array
 _EVENTS_PER_BLOCK = 1 << 19
 _ROS1_EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
 
@@ -62,7 +63,10 @@ def open_bag(path: Path, topic: str | None) -> EventReader:
         height, width = fields.number("I"), fields.number("I")
     sensor = (width, height) if width and height else None
     name = f"ROS {'2' if bag.ros2 else '1'} bag, {chosen.kind.replace('/msg/', '/')}"
-    return StreamReader(path, name, sensor, lambda resume: _blocks(path, chosen.name, chosen.kind, resume), _remarks)
+    rough = chosen.count * len(content) // _BYTES_PER_EVENT[chosen.kind == _PACKET]
+    return StreamReader(
+        path, name, sensor, lambda resume: _blocks(path, chosen.name, chosen.kind, resume), rough, _remarks
+    )
 
 
 def _remarks(resume: Any) -> list[str]:

@@ -69,12 +69,15 @@ class StreamReader:
         format: str,
         sensor: tuple[int, int] | None,
         decode: Decode,
+        rough_count: int,
         remarks: Callable[[Any], list[str]] = lambda resume: [],
         close: Callable[[], None] = lambda: None,
     ) -> None:
-        """`remarks` gets the `resume` of the last block that was read; `close` frees what `decode` holds."""
+        """`rough_count`: about how many events there are; `remarks` gets the `resume` of the last block that was read;
+        `close` frees what `decode` holds."""
         self.path, self.format, self.sensor = path, format, sensor
         self._decode, self._remarks, self._close = decode, remarks, close
+        self._rough_count = rough_count
         self._index = _Index()
 
     def span(self) -> tuple[int, int]:
@@ -86,6 +89,10 @@ class StreamReader:
         """The number of events."""
         self._complete()
         return self._index.count
+
+    def rough_count(self) -> int:
+        """About how many events there are."""
+        return max(1, self._index.count if self._index.complete else self._rough_count)
 
     def triggers(self) -> Triggers:
         """All external triggers."""

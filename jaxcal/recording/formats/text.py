@@ -27,6 +27,7 @@ _UNIT_NAMES = {0: "nanoseconds", 3: "microseconds", 6: "milliseconds", 9: "secon
 # Whole numbers from here on are nanoseconds since 1970: as microseconds they would be the year 5138.
 _SURELY_NS = 10**17
 _HEAD_BYTES = 4096
+_BYTES_PER_LINE = 20  # roughly
 _EXPECTED = (
     "Expected lines of 't x y p' (t in seconds with a decimal point, or whole microseconds; p 0 or 1, or -1 and 1). "
     "Another order or unit is told by a first line such as 'x y p t_us'."
@@ -35,11 +36,13 @@ _EXPECTED = (
 
 @dataclass(frozen=True)
 class _Layout:
-    """`columns` the name of each ('' to pass over); `exponent`: t * 10**exponent is ns; `body` where the lines start,
-    which is line number `line` (from 1); `sensor` where a first line 'width height' told it."""
+    """`columns` the name of each ('' to pass over); `exponent`: t * 10**exponent is ns, as a first line `told`, or by
+    the looks of it; `body` where the lines start, which is line number `line` (from 1); `sensor` (width, height) where
+    the first lines tell it."""
 
     columns: tuple[str, ...]
     exponent: int
+    told: bool
     body: int
     line: int
     sensor: tuple[int, int] | None
@@ -50,13 +53,15 @@ def open_text(path: Path, topic: str | None) -> EventReader:
     no_topic(path, topic, "a text file")
     layout = _layout(path)
 
+    rough = path.stat().st_size // _BYTES_PER_LINE
+
     def remarks(resume: Any) -> list[str]:
-        found = [f"times are read as {_UNIT_NAMES[layout.exponent]}"]
+        found = [] if layout.told else [f"times are taken as {_UNIT_NAMES[layout.exponent]}"]
         if resume is not None and resume[2]:
             found.append(f"line {resume[1]}, the last one, is cut short and was left out")
         return found
 
-    return StreamReader(path, "text", layout.sensor, lambda resume: _blocks(path, layout, resume), remarks)
+    return StreamReader(path, "text", layout.sensor, lambda resume: _blocks(path, layout, resume), rough, remarks)
 
 
 def _blocks(path: Path, layout: _Layout, resume: Any) -> Iterator[Block]:
@@ -114,7 +119,8 @@ def _layout(path: Path) -> _Layout:
                 sensor = int(words[0]), int(words[1])  # as E2VID's text files start
             else:
                 columns = columns or _ORDER
-                return _Layout(columns, _exponent(path, number, words, columns, exponent), offset, number, sensor)
+                guessed = _exponent(path, number, words, columns, exponent)
+                return _Layout(columns, guessed, exponent is not None, offset, number, sensor)
         offset += len(raw)
     if len(head) < _HEAD_BYTES:
         raise empty(path)
