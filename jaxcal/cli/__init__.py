@@ -9,6 +9,7 @@ from jaxcal.cli.compare import compare
 from jaxcal.cli.convert import convert
 from jaxcal.cli.convert_calibration import convert_calibration
 from jaxcal.cli.info import info
+from jaxcal.cli.report import report
 from jaxcal.cli.target import target
 from jaxcal.errors import CalibrationError
 
@@ -53,3 +54,4 @@ main.add_command(convert)
 main.add_command(info)
 main.add_command(calibrate_cameras)
 main.add_command(compare)
+main.add_command(report)

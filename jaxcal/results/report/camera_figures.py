@@ -21,6 +21,7 @@ from jaxcal.results.report.drawing import (
     panel,
     to_svg,
 )
+from jaxcal.results.report.lens_figure import lens_picture
 from jaxcal.results.report.projection_figure import projection_picture
 from jaxcal.results.target_bias import target_bias
 from jaxcal.targets import Target
@@ -34,6 +35,7 @@ def camera_pictures(calibration: Calibration, camera: CameraCalibration, prefix:
     """All figures of a camera, in the order in which they are read; `prefix` is unique in the page."""
     return [
         _coverage_picture(camera, f"{prefix}-coverage"),
+        lens_picture(camera, f"{prefix}-lens"),
         projection_picture(calibration, camera, f"{prefix}-projection"),
         _scatter_picture(camera, f"{prefix}-scatter"),
         _field_picture(camera, f"{prefix}-field"),

@@ -24,6 +24,7 @@ _TALL = (4.4, 4.0)
 _ENVELOPE_BINS = 450
 _ZOOM_SAMPLES = 300
 _FIT_BINS = 80
+_LAGS = 100  # samples
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ def imu_pictures(imu: ImuCalibration, prefix: str) -> list[Picture]:
         _bias_picture(gyro, imu.t_s, f"{prefix}-gyro-bias"),
         _bias_picture(accel, imu.t_s, f"{prefix}-accel-bias"),
         _fit_picture((gyro, accel), imu.t_s, f"{prefix}-fit"),
+        _whiteness_picture((gyro, accel), imu.t_s, f"{prefix}-whiteness"),
     ]
 
 
@@ -185,6 +187,47 @@ def _bias_picture(sensor: _Sensor, t: np.ndarray, prefix: str) -> Picture:
         f"Estimated bias over time. {bands}Dashed: how far the stated random walk reaches from the start (3 sigma).",
         "slow lines that stay between the dashed ones.",
         "a bias that swings with the motion hides another error: noise figures, time offset, or the target's size.",
+    )
+
+
+def autocorrelation(values: np.ndarray, lags: int) -> np.ndarray:
+    """Correlation (lags,) of a series (N,) with itself 1 .. lags samples later; NaN entries take no part."""
+    known = np.isfinite(values)
+    centred = np.where(known, values - np.mean(values[known]) if known.any() else 0.0, 0.0)
+    variance = np.sum(centred**2) / max(int(known.sum()), 1)
+    pairs = np.array([np.sum(known[k:] & known[: len(known) - k]) for k in range(1, lags + 1)])
+    products = np.array([centred[k:] @ centred[: len(centred) - k] for k in range(1, lags + 1)])
+    return products / np.maximum(pairs, 1) / max(variance, np.finfo(np.float64).tiny)
+
+
+def _whiteness_picture(sensors: tuple[_Sensor, _Sensor], t: np.ndarray, prefix: str) -> Picture:
+    figure, rows = panel(2, _TALL)
+    lags = max(1, min(_LAGS, len(t) // 4))
+    seconds = np.arange(1, lags + 1) * float(np.median(np.diff(t)))
+    largest = []
+    for axes, sensor in zip(rows, sensors, strict=True):
+        residuals = sensor.measured - sensor.predicted
+        # What independent residuals give by chance, 2 sigma.
+        bound = 2.0 / np.sqrt(len(t))
+        axes.axhspan(-bound, bound, color=MUTED, alpha=0.2, linewidth=0.0)
+        for axis, colour in enumerate(AXIS_COLOURS):
+            correlation = autocorrelation(residuals[:, axis], lags)
+            largest.append(float(np.abs(correlation).max()))
+            axes.plot(seconds, correlation, color=colour, linewidth=1.0, label="xyz"[axis])
+        axes.axhline(0.0, color=INK, linewidth=0.6)
+        axes.set_ylim(min(-0.3, axes.get_ylim()[0]), max(0.5, axes.get_ylim()[1]))
+        label(axes, "", sensor.title)
+        axes.margins(x=0.01)
+    legend(rows[0], loc="upper right", ncols=3)
+    label(rows[1], "later by [s]", sensors[1].title)
+    return Picture(
+        "Residuals, whiteness",
+        to_svg(figure, prefix),
+        "Correlation of the residuals with themselves a little later; the band is what chance gives (2 sigma). "
+        f"The largest is {max(largest):.2f}.",
+        "lines inside the band but for a few: the residuals are noise, and the sigmas can be believed.",
+        "lines well above it are motion that the spline cannot follow (more knots per second), vibration, or a wrong "
+        "clock: sigmas are then too small unless the noise was raised.",
     )
 
 

@@ -7,18 +7,21 @@ from typing import Any
 
 import jinja2
 import numpy as np
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
 from jaxcal.atomic import write_text
 from jaxcal.observations import Frames
 from jaxcal.progress import Progress, no_progress
+from jaxcal.results.advice import advice
 from jaxcal.results.calibration import Calibration
 from jaxcal.results.report.camera_figures import camera_pictures
 from jaxcal.results.report.drawing import ACCENT, Picture, label, nothing_to_show, panel, to_svg
 from jaxcal.results.report.frames import FramePicture, frame_pictures
 from jaxcal.results.report.imu_figures import imu_pictures
 from jaxcal.results.report.rig_figures import rig_pictures
+from jaxcal.results.report.rig_scene import rig_scene
 from jaxcal.results.report.tables import camera_tables, check_rows, gravity_table, imu_facts
+from jaxcal.results.report.time_figure import time_picture
 from jaxcal.results.verdict import judge
 
 
@@ -60,7 +63,8 @@ def _content(calibration: Calibration) -> dict[str, Any]:
     verdict = judge(calibration)
     names = tuple(camera.name for camera in calibration.cameras)
     others = tuple(dict.fromkeys(check.subject for check in verdict.checks if check.subject not in names))
-    rig = [] if imu is None and len(calibration.cameras) == 1 else rig_pictures(calibration, "rig")
+    is_rig = imu is not None or len(calibration.cameras) > 1
+    times = time_picture(calibration, "time")
     return {
         "title": _title(calibration),
         "subtitle": _subtitle(calibration),
@@ -70,7 +74,9 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         "other_checks": [(subject, check_rows(verdict.checks, (subject,))) for subject in others],
         "warnings": calibration.warnings,
         "gravity": gravity_table(calibration),
-        "rig": rig,
+        "scene": rig_scene(calibration) if is_rig else None,
+        "rig": [*(rig_pictures(calibration, "rig") if is_rig else []), *([times] if times else [])],
+        "advice": advice(calibration),
         "imu_pictures": [] if imu is None else imu_pictures(imu, "imu"),
         "imu_facts": imu_facts(calibration),
         "convergence": _convergence_picture(calibration, "convergence"),
@@ -123,7 +129,7 @@ def _convergence_picture(calibration: Calibration, prefix: str) -> Picture:
         axes.semilogy(np.arange(len(cost))[shown], above[shown], "o-", color=ACCENT, markersize=3.5, linewidth=1.1)
         axes.set_xlim(-0.5, max(len(cost), 2) - 0.5)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.grid(visible=False, which="minor")
+        axes.yaxis.set_minor_locator(NullLocator())
     if not shown.any():
         nothing_to_show(axes, "nothing left to gain" if len(cost) else "no cost recorded")
     label(axes, "step", "cost above the lowest, relative")

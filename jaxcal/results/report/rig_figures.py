@@ -22,9 +22,8 @@ from jaxcal.results.report.drawing import (
 )
 from jaxcal.targets import Target
 
-# Views of the first camera's frame (x right, y down, z forward): rows are the page's right and up.
+# A view of the first camera's frame (x right, y down, z forward): rows are the page's right and up.
 _FROM_ABOVE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-_OBLIQUE = np.array([[np.cos(0.6), 0.0, np.sin(0.6)], [-0.35 * np.sin(0.6), -0.94, 0.35 * np.cos(0.6)]])
 
 
 def rig_poses(calibration: Calibration) -> tuple[list[np.ndarray], np.ndarray | None]:
@@ -45,31 +44,20 @@ def rig_poses(calibration: Calibration) -> tuple[list[np.ndarray], np.ndarray | 
 
 
 def rig_pictures(calibration: Calibration, prefix: str) -> list[Picture]:
-    """Two views of the rig, and with an IMU its path before the target."""
+    """The rig from above, and with an IMU its path before the target."""
     poses, T_cam0_imu = rig_poses(calibration)
-    rims = [_rim_rays(camera) for camera in calibration.cameras]
-    views = (
-        ("The rig, seen from behind and above", _OBLIQUE, "oblique", ("", "")),
-        ("The rig from above", _FROM_ABOVE, "above", ("x of the first camera [m]", "z, forward [m]")),
-    )
-    pictures = []
-    for title, view, name, names in views:
-        figure, (axes,) = panel()
-        _draw_rig(axes, calibration.cameras, rims, poses, T_cam0_imu, view)
-        label(axes, *names)
-        if view is _OBLIQUE:
-            axes.set_axis_off()
-            figure.subplots_adjust(left=0.02, right=0.98, bottom=0.02, top=0.98)
-            _scale_bar(axes)
-        pictures.append(
-            Picture(
-                title,
-                to_svg(figure, f"{prefix}-{name}"),
-                "Cameras as the pyramids of their fields of view, the IMU as its three axes (x red, y green, z blue).",
-                "what you see when you look at the rig: order, spacing and directions.",
-                "compare with a ruler; a camera in the wrong place means too few shared views or a wrong target size.",
-            )
+    figure, (axes,) = panel()
+    _draw_rig(axes, calibration.cameras, [rim_rays(camera) for camera in calibration.cameras], poses, T_cam0_imu)
+    label(axes, "x of the first camera [m]", "z, forward [m]")
+    pictures = [
+        Picture(
+            "The rig from above",
+            to_svg(figure, f"{prefix}-above"),
+            "Cameras as the pyramids of their fields of view, the IMU as its three axes (x red, y green, z blue).",
+            "what you see when you look at the rig: order, spacing and directions.",
+            "compare with a ruler; a camera in the wrong place means too few shared views or a wrong target size.",
         )
+    ]
     if calibration.imu is not None:
         pictures.append(_path_picture(calibration.imu, calibration.target, f"{prefix}-path"))
     return pictures
@@ -81,15 +69,15 @@ def _draw_rig(
     rims: list[np.ndarray],
     poses: list[np.ndarray],
     T_cam0_imu: np.ndarray | None,
-    view: np.ndarray,
 ) -> None:
+    view = _FROM_ABOVE
     centres = np.array([pose[:3, 3] for pose in poses] + ([T_cam0_imu[:3, 3]] if T_cam0_imu is not None else []))
     extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
     size = 0.22 * extent if extent > 1e-6 else 0.05
     flat = centres @ view.T
     axes.plot(*flat[: len(poses)].T, "-", color=MUTED, linewidth=0.8)
     for camera, rim, pose in zip(cameras, rims, poses, strict=True):
-        for line in _frustum(rim * size):
+        for line in frustum(rim * size):
             axes.plot(*((line @ pose[:3, :3].T + pose[:3, 3]) @ view.T).T, color=ACCENT, linewidth=1.1)
         _name(axes, camera.name, pose[:3, 3] @ view.T)
     if T_cam0_imu is not None:
@@ -115,7 +103,7 @@ def _name(axes: Axes, text: str, at: np.ndarray, above: bool = False) -> None:
     )
 
 
-def _rim_rays(camera: CameraCalibration) -> np.ndarray:
+def rim_rays(camera: CameraCalibration) -> np.ndarray:
     """Unit rays (4, 3) through the corners of the image, camera frame; zero where the model has none."""
     width, height = camera.image_size
     corners = jnp.array([[0.0, 0.0], [width - 1.0, 0.0], [width - 1.0, height - 1.0], [0.0, height - 1.0]])
@@ -128,24 +116,9 @@ def _unproject(model: CameraModel, pixels: Float[Array, "n 2"]) -> Float[Array, 
     return model.unproject(pixels)
 
 
-def _frustum(rim: np.ndarray) -> list[np.ndarray]:
+def frustum(rim: np.ndarray) -> list[np.ndarray]:
     """Lines of a pyramid with its tip at the origin: four edges to the points `rim` (4, 3), and the rim."""
     return [*(np.stack([np.zeros(3), point]) for point in rim), np.vstack([rim, rim[:1]])]
-
-
-def _scale_bar(axes: Axes) -> None:
-    low, high = axes.get_xlim()
-    bottom, top = axes.get_ylim()
-    span = high - low
-    length = 10.0 ** np.floor(np.log10(span / 2.5))
-    for factor in (5.0, 2.0):
-        if factor * length < span / 2.5:
-            length = factor * length
-            break
-    x, y = low + 0.04 * span, bottom - 0.12 * (top - bottom)
-    axes.plot([x, x + length], [y, y], color=INK, linewidth=2.0, solid_capstyle="butt")
-    text = f"{length * 1e3:g} mm" if length < 1.0 else f"{length:g} m"
-    axes.annotate(text, (x + length / 2.0, y), (0, 4), textcoords="offset points", ha="center", fontsize=8, color=INK)
 
 
 def _path_picture(imu: ImuCalibration, target: Target, prefix: str) -> Picture:

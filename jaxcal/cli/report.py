@@ -1,0 +1,47 @@
+"""`jaxcal report`: the report of a calibration that was saved, anew."""
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("result", type=click.Path(path_type=Path))
+@click.option(
+    "--images",
+    "sources",
+    multiple=True,
+    metavar="NAME=FOLDER",
+    help="Pictures of a camera, to show its corners on: cam0=left/; may be repeated.",
+)
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="File to write (RESULT/report.html).")
+def report(result: Path, sources: tuple[str, ...], out: Path | None) -> None:
+    """Write the report of a saved calibration, one HTML page that needs nothing else.
+
+    \b
+    jaxcal report result/
+    jaxcal report result/ --images cam0=left/ --images cam1=right/ --out for_the_lab.html
+
+    RESULT is a folder of jaxcal's, or its calibration.npz. A calibration does not hold pictures: without --images the
+    page shows none.
+    """
+    from jaxcal.cli.progress_bars import ProgressBars
+    from jaxcal.errors import CalibrationError
+    from jaxcal.recording import load_frames
+    from jaxcal.results import judge, load_calibration, write_report
+
+    calibration = load_calibration(result)
+    names = [camera.name for camera in calibration.cameras]
+    images = {}
+    for source in sources:
+        name, separator, folder = source.partition("=")
+        if not separator:
+            raise click.UsageError(f"--images {source}: expected NAME=FOLDER, such as cam0=left/.")
+        if name not in names:
+            raise CalibrationError(f"--images {source}: there is no camera '{name}'; {result} has {', '.join(names)}.")
+        images[name] = load_frames(folder)
+    path = out or (result if result.is_dir() else result.parent) / "report.html"
+    with ProgressBars() as bars:
+        write_report(calibration, path, images=images, progress=bars)
+    click.echo(judge(calibration).headline)
+    click.echo(f"report: {path.resolve()}")
