@@ -1,6 +1,7 @@
 """Images of a bag's topic, raw or compressed, read lazily as grey images with the times in their headers."""
 
 import logging
+import weakref
 from pathlib import Path
 
 import cv2
@@ -62,6 +63,7 @@ class BagImages:
         recorded_ns, skip = (int(value) for value in self._places[index])
         if self._bag is None:
             self._bag = Bag(self.path)
+            weakref.finalize(self, self._bag.close)
         messages = self._bag.messages(self.topic, recorded_ns, recorded_ns + 1)
         content = [content for _, content in messages][skip]
         where = f"{self.path}: image {index} of {self.topic}"

@@ -22,8 +22,12 @@ def is_bag(path: Path) -> bool:
         return True
     if not path.is_file():
         return False
+    return _first_bytes(path).startswith(_SIGNATURES)
+
+
+def _first_bytes(path: Path) -> bytes:
     with path.open("rb") as file:
-        return file.read(16).startswith(_SIGNATURES)
+        return file.read(16)
 
 
 @dataclass(frozen=True)
@@ -188,9 +192,9 @@ def _open(path: Path) -> tuple[Any, tuple[type[Exception], ...]]:
     if not path.exists():
         raise CalibrationError(f"{path}: no such bag.")
     errors = (rosbag1.ReaderError, rosbag2.ReaderError, OSError, ValueError, EOFError, KeyError)
-    first = b"" if path.is_dir() else path.open("rb").read(16)
+    ros1 = not path.is_dir() and _first_bytes(path).startswith(_SIGNATURES[0])
     try:
-        reader = rosbag1.Reader(path) if first.startswith(_SIGNATURES[0]) else rosbag2.Reader(path)
+        reader = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
         reader.open()
     except errors as error:
         raise _damaged(path, error) from error

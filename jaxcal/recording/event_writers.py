@@ -33,8 +33,8 @@ def write_events(
 
     .h5: x, y (uint16), p (uint8, 0 or 1) and t (int64 microseconds) at the root, as e2calib reads it; the sensor's size
     as attributes width and height, external triggers in the group `triggers` (t, channel, rising). .npz: the same
-    arrays, and width and height. .txt: lines 't x y p' with t in whole microseconds; .csv: with commas, and the names of
-    the columns in the first line. Times are cut to microseconds. `triggers` is called when all pieces have been read.
+    arrays, and width and height. .txt: lines 't x y p' with t in whole microseconds; .csv: the same with commas. Times
+    are cut to microseconds. `triggers` is called when all pieces have been read.
 
     The file appears when it is complete. Raises CalibrationError when the suffix is none of these, or the folder cannot
     be written.

@@ -128,7 +128,7 @@ def _layout(path: Path) -> _Layout:
 
 
 def _words(line: bytes) -> list[str]:
-    return re.split(r"[\s,;]+", line.decode("utf-8", "replace").strip().lstrip("#% ").strip())
+    return re.findall(r"[^\s,;]+", line.decode("utf-8", "replace").strip().lstrip("#% "))
 
 
 def _names(words: list[str]) -> tuple[tuple[str, ...], int | None] | None:
