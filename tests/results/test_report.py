@@ -2,7 +2,10 @@
 
 import base64
 import dataclasses
+import html
+import json
 import re
+import subprocess
 import threading
 from html.parser import HTMLParser
 from pathlib import Path
@@ -111,6 +114,11 @@ def pair_report(pair: Calibration, tmp_path_factory: pytest.TempPathFactory) -> 
     return report(pair, tmp_path_factory.mktemp("pair"), make_images(pair))
 
 
+@pytest.fixture(scope="module")
+def eight_report(tmp_path_factory: pytest.TempPathFactory) -> tuple[Page, str]:
+    return report(make_calibration(8, False, frames=12), tmp_path_factory.mktemp("eight"))
+
+
 def test_every_section_and_figure_is_there(pair_report: tuple[Page, str]) -> None:
     page, _ = pair_report
     assert page.sections == ["verdict", "parameters", "rig", "camera-0", "camera-1", "imu", "solution"]
@@ -172,8 +180,8 @@ def test_a_saved_calibration_gives_the_same_page(tmp_path: Path) -> None:
     assert report(load_calibration(tmp_path), tmp_path)[1] == report(made, tmp_path)[1]
 
 
-def test_eight_cameras_without_imu_nor_images(tmp_path: Path) -> None:
-    page, text = report(make_calibration(8, False, frames=12), tmp_path)
+def test_eight_cameras_without_imu_nor_images(eight_report: tuple[Page, str]) -> None:
+    page, text = eight_report
     assert page.sections == ["verdict", "parameters", "rig", *(f"camera-{k}" for k in range(8)), "solution"]
     assert all(page.figures(f"camera-{k}") == CAMERA_FIGURES for k in range(8))
     assert page.figures("rig") == 2
@@ -249,6 +257,46 @@ def test_two_reports_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
     for thread in threads:
         thread.join()
     assert [(tmp_path / f"{k}.html").read_text() for k in range(2)] == [alone, alone]
+
+
+# --- in a browser ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.browser
+def test_a_browser_draws_every_figure_and_turns_the_rig(
+    pair_report: tuple[Page, str], eight_report: tuple[Page, str], chromium: str, tmp_path: Path
+) -> None:
+    pages = {"pair": pair_report, "eight": eight_report}
+    for name, (_, text) in pages.items():
+        catch = "<script>var errors = []; window.onerror = (message) => { errors.push(message); };</script>"
+        (tmp_path / f"{name}.html").write_text(text.replace("<head>", f"<head>{catch}", 1))
+    frames = [(name, width) for name in pages for width in (1280, 390)]
+    script = (Path(__file__).parent / "pages_in_browser.js").read_text()
+    inner = "".join(
+        f'<iframe name="{name} {width}" src="{name}.html" width="{width}" height="800"></iframe>'
+        for name, width in frames
+    )
+    (tmp_path / "all.html").write_text(f"<!DOCTYPE html><html><body>{inner}<script>{script}</script></body></html>")
+    arguments = ["--headless=new", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files", "--dump-dom"]
+    arguments += [f"--user-data-dir={tmp_path / 'profile'}", (tmp_path / "all.html").as_uri()]
+    done = subprocess.run([chromium, *arguments], check=True, capture_output=True, text=True, timeout=120)
+    found = re.search(r'<pre id="seen">(.*?)</pre>', done.stdout, re.DOTALL)
+    assert found, done.stderr
+    seen = {entry["name"]: entry for entry in json.loads(html.unescape(found[1]))}
+    assert set(seen) == {f"{name} {width}" for name, width in frames}
+    for name, entry in seen.items():
+        assert entry["errors"] == [], name
+        page = pages[name.split()[0]][0]
+        assert entry["plots"] == sum(page.figures(section) for section in page.sections)
+        assert entry["empty"] == []
+        assert entry["small"] == 0
+        assert entry["overflow"] <= 0, name
+        assert entry["turned"] != entry["before"]
+        assert entry["released"] == entry["turned"]
+        assert entry["keyed"] != entry["turned"]
+        # What the page was written with is what its script draws from the same view.
+        back, before = (np.array(re.findall(r"[-\d.]+", entry[key]), float) for key in ("back", "before"))
+        np.testing.assert_allclose(back, before, atol=0.21)
 
 
 # --- pictures of frames ----------------------------------------------------------------------------------------------
