@@ -20,7 +20,8 @@ from jaxcal.recording.formats.contract import EventColumns, Triggers
 
 _NS_PER_US = 1000
 _DTYPES = {"x": np.dtype(np.uint16), "y": np.dtype(np.uint16), "p": np.dtype(np.uint8), "t": np.dtype(np.int64)}
-_CHUNK = 1 << 17
+# Events per chunk of HDF5, and how many are written at a time at least: a chunk that is added to is written again.
+_CHUNK, _AT_A_TIME = 1 << 16, 1 << 20
 
 
 def write_events(
@@ -107,11 +108,28 @@ def in_order(pieces: Iterable[EventColumns], path: Path, most_late_ns: int) -> I
 
 
 def _split_sorted(parts: list[EventColumns], until_ns: int) -> tuple[EventColumns, EventColumns]:
-    t_ns, x, y, p = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t_ns", "x", "y", "p"))
-    order = np.argsort(t_ns, kind="stable")
-    merged = EventColumns(0, t_ns[order], x[order], y[order], p[order])
+    whole = _joined(parts)
+    order = np.argsort(whole.t_ns, kind="stable")
+    merged = EventColumns(0, whole.t_ns[order], whole.x[order], whole.y[order], whole.p[order])
     place = int(np.searchsorted(merged.t_ns, until_ns, side="right"))
     return merged.part(0, place), merged.part(place, len(merged))
+
+
+def _large(pieces: Iterable[EventColumns]) -> Iterator[EventColumns]:
+    """The same events in pieces of `_AT_A_TIME` or more, but for the last one."""
+    waiting: list[EventColumns] = []
+    for piece in pieces:
+        waiting.append(piece)
+        if sum(map(len, waiting)) >= _AT_A_TIME:
+            yield _joined(waiting)
+            waiting = []
+    if waiting:
+        yield _joined(waiting)
+
+
+def _joined(parts: list[EventColumns]) -> EventColumns:
+    columns = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t_ns", "x", "y", "p"))
+    return EventColumns(parts[0].start, *columns)
 
 
 def _converted(piece: EventColumns) -> dict[str, np.ndarray]:
@@ -148,7 +166,7 @@ def _write_hdf5(
             name: file.create_dataset(name, shape=(0,), maxshape=(None,), dtype=dtype, chunks=(_CHUNK,))
             for name, dtype in _DTYPES.items()
         }
-        for piece in pieces:
+        for piece in _large(pieces):
             for name, values in _converted(piece).items():
                 datasets[name].resize(count + len(piece), axis=0)
                 datasets[name][count:] = values
