@@ -14,16 +14,23 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import scipy.signal
+from click.testing import CliRunner
 from synthetic_calibration import APRIL_GRID, make_calibration, make_images
 
+from jaxcal.cameras import PinholeRadtan
+from jaxcal.cli import main
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import Frames
-from jaxcal.results import Calibration, load_calibration, write_report
+from jaxcal.results import Calibration, judge, write_report
 from jaxcal.results.report.camera_figures import frame_rms
 from jaxcal.results.report.drawing import label, panel, to_svg
 from jaxcal.results.report.frames import frame_pictures
-from jaxcal.results.report.imu_figures import _envelope
+from jaxcal.results.report.imu_figures import _envelope, autocorrelation
+from jaxcal.results.report.lens_figure import _looked, lens_picture
 from jaxcal.results.report.rig_figures import rig_pictures, rig_poses
+from jaxcal.results.report.rig_scene import look, rig_scene
+from jaxcal.results.report.time_figure import time_picture
 
 VOID = {"meta", "link", "br", "hr", "img", "input"}
 CAMERA_FIGURES, IMU_FIGURES = 8, 10
@@ -177,7 +184,10 @@ def test_a_light_and_a_dark_page_and_paper(pair_report: tuple[Page, str]) -> Non
 def test_a_saved_calibration_gives_the_same_page(tmp_path: Path) -> None:
     made = make_calibration(1, False, frames=10)
     made.save(tmp_path)
-    assert report(load_calibration(tmp_path), tmp_path)[1] == report(made, tmp_path)[1]
+    done = CliRunner().invoke(main, ["report", str(tmp_path), "--out", str(tmp_path / "again.html")])
+    assert done.exit_code == 0
+    assert done.output.startswith(judge(made).headline)
+    assert (tmp_path / "again.html").read_text() == report(made, tmp_path)[1]
 
 
 def test_eight_cameras_without_imu_nor_images(eight_report: tuple[Page, str]) -> None:
@@ -375,6 +385,52 @@ def test_cameras_are_drawn_where_the_calibration_puts_them(with_imu: bool) -> No
         np.testing.assert_array_equal(T_cam0_imu, made.cameras[0].T_cam_imu)
     else:
         assert T_cam0_imu is None
+
+
+def test_the_scene_is_drawn_as_its_view_says(pair: Calibration) -> None:
+    scene = rig_scene(pair)
+    assert [name.text for name in scene.names] == ["cam0", "cam1", "imu0"]
+    view = look(scene.yaw, scene.pitch)
+    np.testing.assert_allclose(view @ view.T, np.eye(2), atol=1e-12)
+    # From behind and above: what is further away is higher on the page, what is lower is lower.
+    assert view[1, 2] < 0 < view[1, 1]
+    for line in scene.lines:
+        space = np.array([point.split(",") for point in line.space.split()], float)
+        page = np.array([point.split(",") for point in line.page.split()], float)
+        np.testing.assert_allclose(space @ view.T + [220.0, 165.0], page, atol=0.21)
+        assert np.linalg.norm(space, axis=1).max() < 165.0  # stays in the picture however it is turned
+    baseline = next(line for line in scene.lines if line.kind == "baseline")
+    ends = np.array([point.split(",") for point in baseline.space.split()], float)
+    # The bar is to the scale of the drawing: the cameras are 110 mm apart.
+    millimetres = float(scene.bar_name.removesuffix(" mm"))
+    assert np.linalg.norm(ends[1] - ends[0]) / scene.bar == pytest.approx(110.0 / millimetres, rel=0.01)
+
+
+def test_a_lens_is_drawn_with_the_angles_it_looks_at(pair: Calibration) -> None:
+    camera = dataclasses.replace(pair.cameras[0], model=PinholeRadtan.create([400.0, 400.0, 320.0, 240.0], [0.0] * 4))
+    pixels, angle, straight = _looked(camera)
+    np.testing.assert_allclose(angle, np.arctan(np.hypot(*(pixels - [320.0, 240.0]).transpose(2, 0, 1)) / 400.0))
+    np.testing.assert_allclose(straight, pixels, atol=1e-9)
+    assert lens_picture(camera, "lens").shows.startswith("Contours: degrees off the optical axis, 45° at most")
+
+
+def test_the_correlation_of_residuals_is_that_of_their_process() -> None:
+    random = np.random.default_rng(0)
+    white = random.normal(size=20_000)
+    assert np.abs(autocorrelation(white, 50)).max() < 5.0 / np.sqrt(len(white))
+    coloured = scipy.signal.lfilter([1.0], [1.0, -0.8], white)
+    np.testing.assert_allclose(autocorrelation(coloured, 5), 0.8 ** np.arange(1, 6), atol=0.05)
+    coloured[::7] = np.nan
+    np.testing.assert_allclose(autocorrelation(coloured, 5), 0.8 ** np.arange(1, 6), atol=0.05)
+
+
+def test_time_offsets_are_drawn_where_they_were_sought(pair: Calibration) -> None:
+    picture = time_picture(pair, "time")
+    assert picture is not None
+    assert "cam0 8.0000 ms ± 0.008 ms; cam1 5.0000 ms ± 0.008 ms" in picture.shows
+    assert time_picture(dataclasses.replace(pair, cameras=pair.cameras[:1], blocks=()), "time") is not None
+    without = [dataclasses.replace(camera, timeshift_cam_imu=None) for camera in pair.cameras]
+    assert time_picture(dataclasses.replace(pair, cameras=tuple(without)), "time") is None
 
 
 def test_figures_of_one_page_share_no_id() -> None:
