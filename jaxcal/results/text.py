@@ -124,7 +124,7 @@ def _baseline(calibration: Calibration, index: int, transform: np.ndarray) -> li
     turn, shift = (None, None) if sigma is None else (sigma[:3], sigma[3:])
     return [
         f"baseline T_{index}_{index - 1}:",
-        f"    q: {_with_sigma(quaternion, turn)} (x y z w; the sigma is of a small rotation, rad)",
+        f"    q: {_with_sigma(quaternion, turn)} (x y z w; Kalibr: -x -y -z w; the sigma is of a small rotation, rad)",
         f"    t: {_with_sigma(transform[:3, 3], shift)} [m]",
     ]
 

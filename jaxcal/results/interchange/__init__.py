@@ -7,15 +7,19 @@ from jaxcal.results.interchange.formats import (
     read_calibration,
     write_calibration,
 )
+from jaxcal.results.interchange.kalibr_text import KalibrCameraResult, KalibrResults, read_kalibr_results
 from jaxcal.results.interchange.rig import CalibratedRig, RigImu, rig_of
 
 __all__ = [
     "FORMATS",
     "CalibratedRig",
+    "KalibrCameraResult",
+    "KalibrResults",
     "RigImu",
     "Written",
     "load_calibration_or_rig",
     "read_calibration",
+    "read_kalibr_results",
     "rig_of",
     "write_calibration",
 ]

@@ -10,7 +10,7 @@ from jaxcal.atomic import write_text
 from jaxcal.errors import CalibrationError
 from jaxcal.results.calibration import Calibration
 from jaxcal.results.files import FILE_NAME, load_calibration
-from jaxcal.results.interchange import basalt, colmap, kalibr_files, opencv, ros, vins
+from jaxcal.results.interchange import basalt, colmap, kalibr_files, kalibr_text, opencv, ros, vins
 from jaxcal.results.interchange.documents import SUFFIXES, Document, read_document
 from jaxcal.results.interchange.lenses import require_known
 from jaxcal.results.interchange.rig import CalibratedRig, rig_of
@@ -24,7 +24,8 @@ _POSES, _IMU_POSE, _TIME, _NOISE = "poses between cameras", "poses to the IMU", 
 class Format:
     """A format of files: what it is called, which models it holds, and what of a rig (`loses`) it does not.
 
-    `write` gives the files' content by name, the first of which can stand alone where `first_alone`.
+    `write` gives the files' content by name, the first of which can stand alone where `first_alone`. `texts` are files
+    that only a calibration with its measurements can fill.
     """
 
     title: str
@@ -34,6 +35,7 @@ class Format:
     write: Callable[[CalibratedRig], tuple[dict[str, str], tuple[str, ...]]]
     loses: tuple[str, ...] = ()
     first_alone: bool = False
+    texts: Callable[[Calibration], dict[str, str]] | None = None
 
 
 FORMATS: dict[str, Format] = {
@@ -44,6 +46,7 @@ FORMATS: dict[str, Format] = {
         kalibr_files.read,
         kalibr_files.write_kalibr,
         first_alone=True,
+        texts=kalibr_text.results_files,
     ),
     "openvins": Format(
         "OpenVINS",
@@ -87,6 +90,8 @@ def write_calibration(calibration: Calibration | CalibratedRig, path: str | Path
     for camera in rig.cameras:
         require_known(camera.model, chosen.models, chosen.title, camera.name)
     files, notes = chosen.write(rig)
+    if chosen.texts is not None and isinstance(calibration, Calibration):
+        files |= chosen.texts(calibration)
     placed, more = _placed(files, Path(path), chosen)
     notes = (*notes, *more, *_lost(rig, chosen))
     for place, text in placed.items():
@@ -112,6 +117,11 @@ def read_calibration(path: str | Path) -> CalibratedRig:
     else:
         document = read_document(path)
         name, documents = _format_of(document), [document]
+    if name is None and kalibr_text.is_results_text(documents[0].content if documents else None):
+        raise CalibrationError(
+            f"{path}: Kalibr's results text does not say the image size. Read the camchain beside it, or the text with "
+            "`jaxcal.results.interchange.read_kalibr_results`."
+        )
     if name is None:
         raise CalibrationError(
             f"{path}: not a calibration that is known here. Known are the files of "
