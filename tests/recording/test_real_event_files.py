@@ -9,8 +9,7 @@ import pytest
 from jaxcal.recording import EventFile
 from jaxcal.recording.bags import Bag
 from jaxcal.recording.formats import prophesee_raw
-from jaxcal.recording.formats.evt_state import initial_state
-from jaxcal.recording.formats.prophesee_raw import decode_words
+from jaxcal.recording.formats.evt_decoder import WordDecoder
 
 pytestmark = pytest.mark.real_data
 
@@ -63,7 +62,7 @@ def test_bag_of_evt3_packets_is_what_event_camera_py_reads(data_folder: Path) ->
     assert np.count_nonzero(~edges.rising) == 2_078
     assert np.array_equal(edges.rising, np.arange(len(edges)) % 2 == 0)
     assert set(np.diff(edges.t_ns)) == {500_000}
-    state, total_us = initial_state(), 0
+    decoder, total_us = WordDecoder("evt3"), 0
     with Bag(path) as bag:
         for _, content in bag.messages("/event_camera/events"):
             fields = bag.fields(content)
@@ -72,6 +71,6 @@ def test_bag_of_evt3_packets_is_what_event_camera_py_reads(data_folder: Path) ->
             fields.numbers("Q", 2)
             fields.text()
             fields.number("B")
-            for part in decode_words("evt3", fields.content_bytes(), state):
+            for part in decoder.decode(fields.content_bytes()):
                 total_us += int(part.t_ns.sum()) // 1000
     assert total_us == 2_885_601_049_874

@@ -1,16 +1,14 @@
 """Prophesee RAW files: a header in text, then EVT2, EVT2.1 or EVT3 words."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from jaxcal.errors import CalibrationError
-from jaxcal.recording.formats.contract import EventColumns, EventFormat, EventReader, Triggers, no_topic
-from jaxcal.recording.formats.evt_state import initial_state, state_remarks
+from jaxcal.recording.formats.contract import EventFormat, EventReader, no_topic
+from jaxcal.recording.formats.evt_decoder import WORD_BYTES, WordDecoder
 from jaxcal.recording.formats.streams import Block, StreamReader
 
 # Bytes that are decoded at a time: some ten million events at most.
@@ -30,9 +28,6 @@ _EVT3_SYSTEMS = {0x1E, 0x2E, 0x28, 0x30, 0x32, 0x31}
 _FIRST_LITTLE_ENDIAN_SYSTEM = 0x37  # systems before it write the halves of an EVT2.1 word in the other order
 
 
-Words = bytes | memoryview | np.ndarray
-
-
 @dataclass(frozen=True)
 class RawHeader:
     """`encoding`: evt2, evt21, evt21-legacy or evt3; `sensor` (width, height) or None; `body` where the words start."""
@@ -46,13 +41,13 @@ def open_raw(path: Path, topic: str | None) -> EventReader:
     """Open a RAW file. Raises CalibrationError when the header does not say how the events are encoded."""
     no_topic(path, topic, "a RAW file")
     header = read_header(path)
-    word = word_bytes(header.encoding)
+    word = WORD_BYTES[header.encoding]
     cut = (path.stat().st_size - header.body) % word
 
     def remarks(resume: Any) -> list[str]:
         if resume is None:
             return []
-        found = state_remarks(resume[1])
+        found = resume[1].remarks()
         if cut:
             found.append(f"the last word is cut short ({cut} of {word} bytes): the recording was broken off there")
         return found
@@ -63,53 +58,18 @@ def open_raw(path: Path, topic: str | None) -> EventReader:
 
 
 def _blocks(path: Path, header: RawHeader, resume: Any) -> Iterator[Block]:
-    offset, state = (header.body, initial_state()) if resume is None else resume
-    state = state.copy()
-    word = word_bytes(header.encoding)
+    offset, decoder = (header.body, WordDecoder(header.encoding)) if resume is None else resume
+    decoder = decoder.copy()
+    word = WORD_BYTES[header.encoding]
     with path.open("rb") as file:
         file.seek(offset)
         while content := file.read(BLOCK_BYTES):
             whole = len(content) // word * word
-            events, triggers = decode_words(header.encoding, content[:whole], state)
+            events, triggers = decoder.decode(content[:whole])
             offset += whole
-            yield Block(events, (offset, state.copy()), triggers)
+            yield Block(events, (offset, decoder.copy()), triggers)
             if whole < len(content):
                 return
-
-
-def word_bytes(encoding: str) -> int:
-    """Bytes per word of an encoding."""
-    return {"evt2": 4, "evt21": 8, "evt21-legacy": 8, "evt3": 2}[encoding]
-
-
-def decode_words(
-    encoding: str, content: bytes | memoryview | np.ndarray, state: np.ndarray
-) -> tuple[EventColumns, Triggers]:
-    """Decode whole words of an encoding; `state` (`evt_state.initial_state()` at first) is changed in place."""
-    count, decode, words = _codec(encoding, content)
-    events, triggers = count(*words)
-    t_ns, x, y, p = (np.empty(events, kind) for kind in (np.int64, np.uint16, np.uint16, np.bool_))
-    at_ns, channel, rising = (np.empty(triggers, kind) for kind in (np.int64, np.int64, np.bool_))
-    found, edges = decode(*words, state, t_ns, x, y, p, at_ns, channel, rising)
-    columns = EventColumns(0, t_ns[:found], x[:found], y[:found], p[:found])
-    return columns, Triggers(at_ns[:edges], channel[:edges], rising[:edges])
-
-
-def _codec(
-    encoding: str, content: bytes | memoryview | np.ndarray
-) -> tuple[Callable, Callable, tuple[np.ndarray, ...]]:
-    """The kernels of an encoding, imported when needed (numba takes its time), and the words as they take them."""
-    if encoding == "evt3":
-        from jaxcal.recording.formats import evt3
-
-        return evt3.count, evt3.decode, (np.frombuffer(content, evt3.WORD),)
-    from jaxcal.recording.formats import evt2
-
-    if encoding == "evt2":
-        return evt2.count, evt2.decode, (np.frombuffer(content, evt2.WORD_2), np.empty(0, np.uint32))
-    halves = np.frombuffer(content, evt2.WORD_2).reshape(-1, 2)
-    upper, lower = (halves[:, 0], halves[:, 1]) if encoding == "evt21-legacy" else (halves[:, 1], halves[:, 0])
-    return evt2.count, evt2.decode, (np.ascontiguousarray(upper), np.ascontiguousarray(lower))
 
 
 # --- header ----------------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Events in bags: arrays of events (dvs_msgs, prophesee_event_msgs) and packets of encoded ones (event_camera_msgs)."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +10,14 @@ import numpy as np
 from jaxcal.errors import CalibrationError
 from jaxcal.recording.bags import Bag, Fields, is_bag
 from jaxcal.recording.formats.contract import EventColumns, EventFormat, EventReader, Triggers, joined_triggers
-from jaxcal.recording.formats.evt_state import initial_state, state_remarks
-from jaxcal.recording.formats.prophesee_raw import decode_words, word_bytes
+from jaxcal.recording.formats.evt_decoder import WORD_BYTES, WordDecoder
 from jaxcal.recording.formats.streams import Block, StreamReader
 
 _ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 _PACKET = "event_camera_msgs/msg/EventPacket"
 EVENT_TYPES = (*_ARRAYS, _PACKET)
 # What an EventPacket may hold, of what its drivers write.
-_EVT = {"evt2": "evt2", "evt21": "evt21", "evt3": "evt3"}
+_EVT = ("evt2", "evt21", "evt3")
 _MONO = "mono"
 
 _BYTES_PER_EVENT = {True: 3, False: 13}  # of a packet, roughly; of an array
@@ -30,21 +29,21 @@ _ROS1_EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"),
 class _State:
     """Where decoding resumes, and what it must know there.
 
-    `time_ns`, `seen`: that of the last message, and how many messages of that time have been read; `evt` the decoder's
-    state; `offset_ns` from the sensor's clock to ROS time, None until the first event; `next_packet` the expected
+    `time_ns`, `seen`: that of the last message, and how many messages of that time have been read; `decoder` that of
+    the packets; `offset_ns` from the sensor's clock to ROS time, None until the first event; `next_packet` the expected
     sequence number; `lost` how many packets are missing.
     """
 
     time_ns: int | None = None
     seen: int = 0
-    evt: np.ndarray = field(default_factory=initial_state)
+    decoder: WordDecoder | None = None
     offset_ns: int | None = None
     next_packet: int | None = None
     lost: int = 0
     cut: int = 0
 
     def copy(self) -> "_State":
-        return _State(self.time_ns, self.seen, self.evt.copy(), self.offset_ns, self.next_packet, self.lost, self.cut)
+        return replace(self, decoder=self.decoder and self.decoder.copy())
 
 
 def open_bag(path: Path, topic: str | None) -> EventReader:
@@ -72,7 +71,7 @@ def open_bag(path: Path, topic: str | None) -> EventReader:
 def _remarks(resume: Any) -> list[str]:
     if resume is None:
         return []
-    found = state_remarks(resume.evt)
+    found = resume.decoder.remarks() if resume.decoder is not None else []
     if resume.lost:
         found.append(f"{resume.lost} packets of events are missing: they were lost while recording")
     if resume.cut:
@@ -180,10 +179,11 @@ def _packet(path: Path, fields: Fields, state: _State) -> tuple[EventColumns, Tr
             f"{path}: packets of events are encoded as '{encoding}'; known here: {', '.join([*_EVT, _MONO])}. Convert "
             "them with event_camera_tools."
         )
-    word = word_bytes(_EVT[encoding])
-    whole = len(content) // word * word
+    if state.decoder is None:
+        state.decoder = WordDecoder(encoding)
+    whole = len(content) // WORD_BYTES[encoding] * WORD_BYTES[encoding]
     state.cut += whole < len(content)
-    events, triggers = decode_words(_EVT[encoding], content[:whole], state.evt)
+    events, triggers = state.decoder.decode(content[:whole])
     if state.offset_ns is None and (len(events) or len(triggers)):
         first = min(int(part.t_ns[0]) for part in (events, triggers) if len(part))
         state.offset_ns = stamp_ns - first
