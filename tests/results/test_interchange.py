@@ -101,6 +101,9 @@ def test_files_of_lenses_alone_keep_their_order_and_say_what_is_lost(tmp_path: P
 
 def test_a_calibration_of_ours_is_written_and_its_folder_read(tmp_path: Path) -> None:
     made = make_calibration(2, True, frames=6)
+    # Without poses of the board the text beside it is quickly written.
+    bare = tuple(dataclasses.replace(camera, T_cam_target=None) for camera in made.cameras)
+    made = dataclasses.replace(made, cameras=bare)
     made.save(tmp_path / "ours")
     rig = read_calibration(tmp_path / "ours")
     assert rig.format == "jaxcal"
