@@ -19,7 +19,7 @@ from jaxcal import pipeline as pipeline_module
 from jaxcal.cameras import PinholeRadtan
 from jaxcal.observations import Events, Frames
 from jaxcal.pipeline import PipelineSettings
-from jaxcal.recording import EventFile
+from jaxcal.recording import EventFile, convert_events
 
 BOARD = Checkerboard(rows=5, cols=8, spacing=0.05)
 TARGET = BOARD.to_yaml()
@@ -207,6 +207,21 @@ def test_frames_are_made_again_when_their_origin_changes(
     walk(event_rig)
     assert len(network.windows) == (2 * made if change == "weights" else made + made // 2)
     assert len(list((event_rig.parent / ".jaxcal" / "frames").iterdir())) == 2  # the old ones are gone
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".txt"])
+def test_frames_do_not_depend_on_the_format_of_the_events(
+    event_rig: Path, network: SimpleNamespace, handed_over: dict[str, Frames], suffix: str
+) -> None:
+    walk(event_rig)
+    times, images = handed_over["cam0"].timestamps_ns, list(handed_over["cam0"].images)
+    source = event_rig.parent / "cam0.h5"
+    with EventFile(source, 32, 24) as events:
+        convert_events(events, source.with_suffix(suffix))
+    event_rig.write_text(event_rig.read_text().replace("cam0.h5", f"cam0{suffix}"))
+    walk(event_rig)
+    assert np.array_equal(handed_over["cam0"].timestamps_ns, times)
+    assert np.array_equal(list(handed_over["cam0"].images), images)
 
 
 def test_an_interrupted_reconstruction_leaves_nothing_half_done(

@@ -9,12 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 from event_encoders import Stream, evt3, stream
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from jaxcal import CalibrationError, ImuNoise, load_imu
-from jaxcal.recording import EventFile, load_frames
+from jaxcal import CalibrationError, ImuNoise, load_imu, load_rig
+from jaxcal.recording import EventFile, RigCamera, load_frames
 from jaxcal.recording.formats import rosbag as rosbag_module
 
 KINDS = ("ros1", "sqlite", "mcap")
@@ -270,29 +271,79 @@ def test_images_that_cannot_be_used_are_named(tmp_path: Path) -> None:
         load_frames(f"{path}:/cut")
 
 
+def write_imu(bag: BagWriter, gyro: np.ndarray, accel: np.ndarray) -> None:
+    def vector(values: np.ndarray) -> Any:
+        return bag.make("geometry_msgs/msg/Vector3", x=values[0], y=values[1], z=values[2])
+
+    for k in range(len(gyro)):
+        message = bag.make(
+            "sensor_msgs/msg/Imu",
+            header=bag.header(T0_NS + k * 5_000_000),
+            orientation=bag.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation_covariance=np.full(9, 7.0),
+            angular_velocity=vector(gyro[k]),
+            angular_velocity_covariance=np.full(9, 8.0),
+            linear_acceleration=vector(accel[k]),
+            linear_acceleration_covariance=np.full(9, 9.0),
+        )
+        bag.write("/imu", T0_NS + k * 5_000_000 + 3, message)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_imu(tmp_path: Path, kind: str) -> None:
     path = bag_path(tmp_path, kind)
-    rng = np.random.default_rng(2)
-    gyro, accel = rng.normal(size=(2, 10, 3))
+    gyro, accel = np.random.default_rng(2).normal(size=(2, 10, 3))
     with bag_writer(path, kind) as bag:
-
-        def vector(values: np.ndarray) -> Any:
-            return bag.make("geometry_msgs/msg/Vector3", x=values[0], y=values[1], z=values[2])
-
-        for k in range(10):
-            message = bag.make(
-                "sensor_msgs/msg/Imu",
-                header=bag.header(T0_NS + k * 5_000_000),
-                orientation=bag.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-                orientation_covariance=np.full(9, 7.0),
-                angular_velocity=vector(gyro[k]),
-                angular_velocity_covariance=np.full(9, 8.0),
-                linear_acceleration=vector(accel[k]),
-                linear_acceleration_covariance=np.full(9, 9.0),
-            )
-            bag.write("/imu", T0_NS + k * 5_000_000 + 3, message)
+        write_imu(bag, gyro, accel)
     imu = load_imu(NOISE, path)
     assert np.array_equal(imu.timestamps_ns, T0_NS + np.arange(10) * 5_000_000)
     assert np.array_equal(imu.gyro_rad_s, gyro)
     assert np.array_equal(imu.accel_m_s2, accel)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_a_rig_of_one_bag(tmp_path: Path, kind: str) -> None:
+    path = bag_path(tmp_path, kind)
+    events = stream(np.arange(100) * 10)
+    with bag_writer(path, kind) as bag:
+        write_arrays(bag, events, [100])
+        for topic in ("/cam0/image_raw", "/cam1/image_raw"):
+            write_images(bag, topic, "mono8", [T0_NS, T0_NS + 1000])
+        write_imu(bag, *np.zeros((2, 5, 3)))
+    cameras = [
+        {"name": "dvs", "model": "pinhole-radtan", "events": path.name},
+        {"name": "left", "model": "pinhole-radtan", "frames": f"{path.name}:/cam0/image_raw"},
+    ]
+    noise = {
+        "accelerometer_noise_density": 1e-2,
+        "accelerometer_random_walk": 1e-3,
+        "gyroscope_noise_density": 1e-3,
+        "gyroscope_random_walk": 1e-4,
+    }
+    target = {
+        "target_type": "checkerboard",
+        "targetRows": 5,
+        "targetCols": 6,
+        "rowSpacingMeters": 0.05,
+        "colSpacingMeters": 0.05,
+    }
+    content = {"target": target, "cameras": cameras, "imu": {"data": f"{path.name}:/imu", "noise": noise}}
+    listing = tmp_path / "rig.yaml"
+    listing.write_text(yaml.safe_dump(content))
+    rig = load_rig(listing)
+    with rig.cameras[0].open_events() as file:
+        assert (len(file), file.size) == (100, (64, 48))
+    assert len(rig.cameras[1].load_frames()) == 2
+    assert rig.imu is not None
+    assert len(rig.imu.load()) == 5
+    cameras[1]["frames"] = f"absent{path.name}:/cam0/image_raw"
+    listing.write_text(yaml.safe_dump(content))
+    with pytest.raises(CalibrationError, match=r"cameras\[1\].frames: .*absentdrive.*does not exist"):
+        load_rig(listing)
+
+
+def test_events_without_a_size_are_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "events.npz", **{name: np.arange(3) for name in "xypt"})
+    camera = RigCamera("dvs", "pinhole-radtan", events=tmp_path / "events.npz")
+    with pytest.raises(CalibrationError, match=r"events.npz: .* Give 'resolution: .width, height.' for 'dvs'"):
+        camera.open_events()

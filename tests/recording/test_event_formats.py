@@ -83,6 +83,15 @@ def test_dat_round_trip(folder: Path, events: Stream, block: int) -> None:
         assert_reads(write_dat(folder / "file.dat", events), events)
 
 
+def test_dat_disorder_around_the_wrap_is_a_step_back_of_microseconds(folder: Path) -> None:
+    late = Stream(*(values[[0, 2, 1, 3]] for values in vars(stream((1 << 32) + np.arange(-2, 2))).values()))
+    with EventFile(write_dat(folder / "wrap.dat", late), WIDTH, HEIGHT) as file:
+        times = np.concatenate([piece.t_ns for piece in file.unchecked_columns()])
+        assert np.array_equal(times, late.t * 1000)
+        with pytest.raises(CalibrationError, match="time runs backwards near event 2"):
+            list(file.chunks())
+
+
 @pytest.mark.parametrize("style", ["seconds", "us", "named", "savetxt"])
 @given(events=streams(st.integers(0, 2_000_000_000_000_000), TWO_SECONDS), block=st.integers(30, 3000))
 @settings(quick, max_examples=20)

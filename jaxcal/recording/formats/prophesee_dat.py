@@ -13,6 +13,7 @@ from jaxcal.recording.formats.streams import Block, StreamReader
 
 _RECORD = np.dtype([("t", "<u4"), ("xyp", "<u4")])
 _RECORDS_PER_BLOCK = 1 << 20
+_HALF_TURN = 1 << 31
 _EVENT_TYPES = (0, 12)  # Event2D of older tools, EventCD
 _TRIGGER_TYPE = 14
 
@@ -49,7 +50,7 @@ def open_dat(path: Path, topic: str | None) -> EventReader:
 
 
 def _blocks(path: Path, body: int, resume: Any) -> Iterator[Block]:
-    offset, last, loops = (body, 0, 0) if resume is None else resume
+    offset, last, loops = (body, None, 0) if resume is None else resume
     with path.open("rb") as file:
         file.seek(offset)
         while content := file.read(_RECORDS_PER_BLOCK * _RECORD.itemsize):
@@ -57,9 +58,10 @@ def _blocks(path: Path, body: int, resume: Any) -> Iterator[Block]:
             if not len(records):
                 return
             raw = records["t"].astype(np.int64)
-            # The 32-bit time wraps after 71 min: then it falls by nearly all of its range.
-            wraps = np.diff(raw, prepend=last) < -(1 << 31)
-            turns = loops + np.cumsum(wraps)
+            # The 32-bit time wraps after 71 min: then it falls by nearly all of its range. Where it rises by as much,
+            # an event from before the wrap has come behind one from after it.
+            steps = np.diff(raw, prepend=raw[0] if last is None else last)
+            turns = loops + np.cumsum((steps < -_HALF_TURN).astype(np.int64) - (steps > _HALF_TURN))
             xyp = records["xyp"]
             x, y = (xyp & 0x3FFF).astype(np.uint16), (xyp >> 14 & 0x3FFF).astype(np.uint16)
             events = EventColumns(0, (raw + (turns << 32)) * 1000, x, y, (xyp >> 28 & 1).astype(bool))
