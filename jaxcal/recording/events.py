@@ -219,15 +219,18 @@ def _check_order(path: Path, piece: EventColumns, latest: int | None) -> None:
 
 def _check_inside(path: Path, piece: EventColumns, size: tuple[int, int]) -> None:
     width, height = size
-    outside = (piece.x >= width) | (piece.y >= height)
-    if piece.x.dtype.kind != "u" or piece.y.dtype.kind != "u":
-        outside |= (piece.x < 0) | (piece.y < 0)
-    if outside.any():
-        place = int(np.argmax(outside))
-        raise CalibrationError(
-            f"{path}: event {piece.start + place} at (x, y) = ({piece.x[place]}, {piece.y[place]}) lies outside the "
-            f"{width}x{height} sensor. Check the resolution given for this camera."
-        )
+    if _all_within(piece.x, width) and _all_within(piece.y, height):
+        return
+    place = int(np.argmax((piece.x < 0) | (piece.x >= width) | (piece.y < 0) | (piece.y >= height)))
+    raise CalibrationError(
+        f"{path}: event {piece.start + place} at (x, y) = ({piece.x[place]}, {piece.y[place]}) lies outside the "
+        f"{width}x{height} sensor. Check the resolution given for this camera."
+    )
+
+
+def _all_within(values: np.ndarray, end: int) -> bool:
+    """Whether all are from 0 to `end`, which does not count; by extremes, which is quicker than by each."""
+    return not len(values) or bool(values.max() < end and (values.dtype.kind == "u" or values.min() >= 0))
 
 
 def _between(piece: EventColumns, t0_ns: int | None, t1_ns: int | None) -> EventColumns:
