@@ -313,6 +313,28 @@ def test_a_lens_that_a_format_cannot_hold_is_refused_with_a_way_out(tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("format", FORMATS)
+@settings(deadline=None, max_examples=12)
+@given(data=st.data())
+def test_a_damaged_file_is_read_or_refused_by_name(
+    format: str, data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp(format)
+    model = "pinhole-equi" if "pinhole-equi" in FORMATS[format].models else "pinhole-radtan"
+    path = data.draw(st.sampled_from(write_calibration(make_rig([model], True, 1), folder, format).paths))
+    words = re.split(r"(?<=[ \n])", path.read_text())
+    place = data.draw(st.integers(0, len(words) - 1))
+    words[place] = data.draw(
+        st.sampled_from(["", "\n", "foo ", "nan ", "[", "{} ", "null ", "1e400 ", "-1 ", ": ", '"'])
+    )
+    path.write_text("".join(words[: data.draw(st.sampled_from([len(words), place + 1]))]))
+    try:
+        outcome = read_calibration(path).format
+    except CalibrationError as error:
+        outcome = str(error)
+    assert outcome in FORMATS or str(folder) in outcome
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [

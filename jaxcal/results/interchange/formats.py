@@ -127,7 +127,13 @@ def read_calibration(path: str | Path) -> CalibratedRig:
             f"{path}: not a calibration that is known here. Known are the files of "
             f"{', '.join(format.title for format in FORMATS.values())}, and the folders of jaxcal."
         )
-    return FORMATS[name].read(documents)
+    try:
+        return FORMATS[name].read(documents)
+    except (KeyError, ValueError, TypeError, AttributeError, IndexError, ArithmeticError) as error:
+        raise CalibrationError(
+            f"{path}: the content is damaged ({type(error).__name__}: {error}). Write it again with "
+            f"{FORMATS[name].title} or whatever made it."
+        ) from error
 
 
 def load_calibration_or_rig(path: str | Path) -> Calibration | CalibratedRig:

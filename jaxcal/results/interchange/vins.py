@@ -82,7 +82,7 @@ def read(documents: list[Document]) -> CalibratedRig:
 def _rig_of_config(config: Document) -> CalibratedRig:
     where = str(config.path)
     with_imu = bool(config.content.get("imu", 1))
-    shift = float(config.content.get("td", 0.0)) if with_imu else None
+    shift = (_number(config, "td") if "td" in config.content else 0.0) if with_imu else None
     count = int(config.content.get("num_of_cam", 1))
     T_body_cam = [
         rigid_transform(config[f"body_T_cam{k}"], f"{where}: body_T_cam{k}")
@@ -106,10 +106,14 @@ def _rig_of_config(config: Document) -> CalibratedRig:
         )
     if not with_imu:
         return CalibratedRig(tuple(cameras), format="vins")
-    densities = [float(config[key]) for key in ("gyr_n", "gyr_w", "acc_n", "acc_w")]
-    gravity = config.content.get("g_norm")
+    densities = [_number(config, key) for key in ("gyr_n", "gyr_w", "acc_n", "acc_w")]
+    gravity = _number(config, "g_norm") if "g_norm" in config.content else None
     imu = RigImu(ImuNoise(*densities))
-    return CalibratedRig(chained(cameras), imu, None if gravity is None else float(gravity), "vins")
+    return CalibratedRig(chained(cameras), imu, gravity, "vins")
+
+
+def _number(document: Document, key: str) -> float:
+    return float(numbers(document[key], (), f"{document.path}: {key}"))
 
 
 # --- configuration ---------------------------------------------------------------------------------------------------
