@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import ImuNoise
 from jaxcal.results.calibration import Calibration, ImuCalibration
@@ -82,7 +83,7 @@ def chained(cameras: Iterable[CamchainCamera]) -> tuple[CamchainCamera, ...]:
 
 def camera_alone(
     name: str,
-    model: object,
+    model: CameraModel,
     image_size: tuple[int, int],
     *,
     T_cn_cnm1: np.ndarray | None = None,
@@ -91,7 +92,7 @@ def camera_alone(
     rostopic: str | None = None,
 ) -> CamchainCamera:
     """A camera of which nothing but what is given is known."""
-    return CamchainCamera(name, model, image_size, T_cn_cnm1, T_cam_imu, timeshift_cam_imu, (), rostopic)  # pyright: ignore[reportArgumentType]
+    return CamchainCamera(name, model, image_size, T_cn_cnm1, T_cam_imu, timeshift_cam_imu, (), rostopic)
 
 
 def shared_timeshift(rig: CalibratedRig) -> tuple[float, tuple[str, ...]]:
