@@ -8,6 +8,7 @@ from jaxcal.cli.calibrate_cameras import calibrate_cameras
 from jaxcal.cli.compare import compare
 from jaxcal.cli.convert import convert
 from jaxcal.cli.convert_calibration import convert_calibration
+from jaxcal.cli.imu_noise import imu_noise
 from jaxcal.cli.info import info
 from jaxcal.cli.report import report
 from jaxcal.cli.target import target
@@ -22,6 +23,11 @@ Print a board (board.pdf, and board.yaml that describes it):
 \b
 Record it from many sides, near and far, up to the image's corners; then calibrate two cameras at once:
     jaxcal calibrate-cameras left/ right/ --target board.yaml --models pinhole-radtan --out result
+
+\b
+See what an event recording or a bag holds, and bring it into another format:
+    jaxcal info recording.raw
+    jaxcal convert events recording.raw events.h5
 
 \b
 Use another lens model afterwards, and see what that costs:
@@ -52,6 +58,7 @@ main.add_command(target)
 convert.add_command(convert_calibration)
 main.add_command(convert)
 main.add_command(info)
+main.add_command(imu_noise)
 main.add_command(calibrate_cameras)
 main.add_command(compare)
 main.add_command(report)
