@@ -28,15 +28,22 @@ def convert_calibration(source: Path, out: Path, format: str, imu: Path | None) 
     from dataclasses import replace
 
     from jaxcal.errors import CalibrationError
-    from jaxcal.results.interchange import read_calibration, write_calibration
+    from jaxcal.results.interchange import (
+        CalibratedRig,
+        load_calibration_or_rig,
+        read_calibration,
+        rig_of,
+        write_calibration,
+    )
 
-    rig = read_calibration(source)
+    found_here = load_calibration_or_rig(source)
+    rig = found_here if isinstance(found_here, CalibratedRig) else rig_of(found_here)
     if imu is not None:
         found = read_calibration(imu).imu
         if found is None:
             raise CalibrationError(f"{imu}: describes no IMU. Give the imu.yaml that Kalibr reads or writes.")
         rig = replace(rig, imu=found)
-    done = write_calibration(rig, out, format)
+    done = write_calibration(found_here if imu is None else rig, out, format)
     cameras = "1 camera" if len(rig.cameras) == 1 else f"{len(rig.cameras)} cameras"
     click.echo(f"{source}: {rig.format}, {cameras}{'' if rig.imu is None else ' and an IMU'}")
     for path in done.paths:

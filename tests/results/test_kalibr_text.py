@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 from synthetic_calibration import APRIL_GRID, make_calibration
 
+from jaxcal.cli import main
 from jaxcal.errors import CalibrationError
 from jaxcal.results import Calibration, load_camchain, read_calibration, write_calibration
 from jaxcal.results.interchange import read_kalibr_results
@@ -100,6 +102,15 @@ def test_what_is_written_without_an_imu_is_read(made: Calibration, tmp_path: Pat
     T = made.cameras[1].T_cn_cnm1
     assert T is not None
     np.testing.assert_allclose(Rotation.from_quat([-x, -y, -z, w]).as_matrix(), T[:3, :3], atol=1e-7)
+
+
+def test_the_command_writes_the_text_too(made: Calibration, tmp_path: Path) -> None:
+    cameras = tuple(dataclasses.replace(camera, T_cam_target=None) for camera in made.cameras)
+    dataclasses.replace(made, cameras=cameras).save(tmp_path / "ours")
+    command = ["convert", "calibration", str(tmp_path / "ours"), str(tmp_path / "theirs"), "--format", "kalibr"]
+    assert CliRunner().invoke(main, command, catch_exceptions=False).exit_code == 0
+    names = sorted(path.name for path in (tmp_path / "theirs").iterdir())
+    assert names == ["camchain-imucam.yaml", "imu.yaml", "results-imucam.txt"]
 
 
 def test_other_texts_are_refused(made: Calibration, tmp_path: Path) -> None:
