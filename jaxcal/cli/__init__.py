@@ -33,6 +33,11 @@ See what an event recording or a bag holds, and bring it into another format:
 Use another lens model afterwards, and see what that costs:
     jaxcal convert camera result/camchain.yaml --to ds-none --out double_sphere.yaml
 
+\b
+Hold it against last month's, and hand it to another tool:
+    jaxcal compare result/ last_month/ --plot difference.png
+    jaxcal convert calibration result/ basalt.json --format basalt
+
 Lengths are metres. Every command says more with --help.
 """
 
