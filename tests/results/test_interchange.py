@@ -298,6 +298,24 @@ def test_colmaps_smaller_models_are_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(radial.model.parameters, [500, 500, 319.5, 239.5, -0.1, 0, 0, 0])
 
 
+def test_names_of_cameras_become_names_of_files(tmp_path: Path) -> None:
+    rig = make_rig(["pinhole-radtan"] * 2, False, 0)
+
+    def named(*names: str) -> CalibratedRig:
+        cameras = [dataclasses.replace(camera, name=name) for camera, name in zip(rig.cameras, names, strict=True)]
+        return dataclasses.replace(rig, cameras=tuple(cameras))
+
+    for k, (names, files) in enumerate(
+        [
+            (("narrow_stereo/left", "../right"), ["narrow_stereo_left.yaml", "right.yaml"]),
+            (("camera", "camera"), ["cam0.yaml", "cam1.yaml"]),
+        ]
+    ):
+        done = write_calibration(named(*names), tmp_path / str(k), "ros")
+        assert [path.name for path in done.paths] == files
+        assert [camera.name for camera in read_calibration(tmp_path / str(k)).cameras] == list(names)
+
+
 # --- what cannot be ---------------------------------------------------------------------------------------------------
 
 

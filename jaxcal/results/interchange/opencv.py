@@ -9,7 +9,7 @@ from jaxcal.cameras import CameraModel, camera_model, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.results.interchange.documents import Document
 from jaxcal.results.interchange.lenses import PLANAR, core_of, planar
-from jaxcal.results.interchange.rig import CalibratedRig, camera_alone, chained
+from jaxcal.results.interchange.rig import CalibratedRig, camera_alone, chained, file_stems
 from jaxcal.results.kalibr import CamchainCamera, numbers, rigid_transform
 
 # cv2.projectPoints; cv2.fisheye; cv2.omnidir with its xi.
@@ -30,7 +30,7 @@ def write(rig: CalibratedRig) -> tuple[dict[str, str], tuple[str, ...]]:
     `fisheye_model` 1 stands for cv2.fisheye, a key `xi` for cv2.omnidir. Beside OpenCV's own keys stand Kalibr's
     `T_cn_cnm1`, `T_cam_imu` and `timeshift_cam_imu`, where they are known.
     """
-    return {f"{camera.name}.yml": _text(camera) for camera in rig.cameras}, ()
+    return {f"{stem}.yml": _text(camera) for stem, camera in zip(file_stems(rig), rig.cameras, strict=True)}, ()
 
 
 def read(documents: list[Document]) -> CalibratedRig:

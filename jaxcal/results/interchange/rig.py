@@ -1,5 +1,6 @@
 """`CalibratedRig`: what files of other tools can hold of a calibration, without its measurements and uncertainty."""
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -93,6 +94,13 @@ def camera_alone(
 ) -> CamchainCamera:
     """A camera of which nothing but what is given is known."""
     return CamchainCamera(name, model, image_size, T_cn_cnm1, T_cam_imu, timeshift_cam_imu, (), rostopic)
+
+
+def file_stems(rig: CalibratedRig) -> list[str]:
+    """A file name, without its suffix, for each camera: its name where that can be one and is no other's."""
+    stems = [re.sub(r"[^\w.-]+", "_", camera.name).strip("._") for camera in rig.cameras]
+    unique = len(set(stems)) == len(stems) and all(stems)
+    return stems if unique else [f"cam{k}" for k in range(len(stems))]
 
 
 def shared_timeshift(rig: CalibratedRig) -> tuple[float, tuple[str, ...]]:

@@ -7,7 +7,7 @@ from jaxcal.cameras import CameraModel, camera_model, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.results.interchange.documents import Document, value_of
 from jaxcal.results.interchange.lenses import coefficients_of, core_of, planar
-from jaxcal.results.interchange.rig import CalibratedRig, camera_alone
+from jaxcal.results.interchange.rig import CalibratedRig, camera_alone, file_stems
 from jaxcal.results.kalibr import CamchainCamera, numbers
 
 # Our name, ROS's name, and how many coefficients ROS writes (sensor_msgs/distortion_models).
@@ -29,7 +29,7 @@ def recognises(document: Document) -> bool:
 
 def write(rig: CalibratedRig) -> tuple[dict[str, str], tuple[str, ...]]:
     """One file per camera, <name>.yaml. The projection matrix is that of the distorted image: nothing is rectified."""
-    return {f"{camera.name}.yaml": _text(camera) for camera in rig.cameras}, ()
+    return {f"{stem}.yaml": _text(camera) for stem, camera in zip(file_stems(rig), rig.cameras, strict=True)}, ()
 
 
 def read(documents: list[Document]) -> CalibratedRig:
