@@ -73,8 +73,9 @@ def test_raw_round_trip(folder: Path, encoding: str, data: st.DataObject, block:
         assert_reads(path, events)
 
 
-@given(events=streams(st.integers((1 << 32) - 5_000_000, 1 << 33), TWO_SECONDS), block=st.integers(1, 60))
-@quick
+@pytest.mark.parametrize("block", [1, 7, 60])
+@given(events=streams(st.integers((1 << 32) - 3_000_000, (1 << 32) + 3_000_000), TWO_SECONDS))
+@settings(quick, max_examples=25)
 def test_dat_round_trip(folder: Path, events: Stream, block: int) -> None:
     # The 32 bits of a file's first time are all that is known of it.
     events = Stream(events.t - (events.t[0] >> 32 << 32), events.x, events.y, events.p)
@@ -157,6 +158,17 @@ def test_evt3_time_high_that_flickers_around_its_wrap_wraps_once(folder: Path) -
     wrap = 1 << 24
     assert times == [wrap - 4096 + 7, wrap + 1, wrap + 1, wrap + 9]
     assert "by 97 us at most" in remarks[0]
+
+
+def test_evt3_vectors_follow_one_another(folder: Path) -> None:
+    path = folder / "vectors.raw"
+    vectors = [HIGH, LOW | 1, 5, 0x3802, 0x5081, 0x4801, 0x5001, 0x4001]  # base 2: 8, 12, 8, 12 columns
+    decoded_times(path, vectors)
+    with EventFile(path) as file:
+        found = file.window(0, 10**9)
+    assert found.x.tolist() == [2, 2 + 7, 2 + 8, 2 + 8 + 11, 2 + 20, 2 + 28]
+    assert found.y.tolist() == [5] * 6
+    assert found.p.all()
 
 
 def test_evt3_repeated_time_high_keeps_time_low(folder: Path) -> None:

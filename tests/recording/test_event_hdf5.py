@@ -56,9 +56,12 @@ def assert_windows(
 
 
 @pytest.mark.parametrize("block", [1, 100, 65_536])
-def test_dsec(tmp_path: Path, events: Stream, block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dsec(
+    tmp_path: Path, events: Stream, block: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setattr(columns_module, "BLOCK", block)
     assert_windows(write_dsec(tmp_path / "events.h5", events, milliseconds(events)), events, OFFSET_US)
+    assert caplog.text == ""  # its table of milliseconds has been used
 
 
 def test_table_of_milliseconds_that_is_wrong_leads_nobody_astray(
