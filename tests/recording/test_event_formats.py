@@ -28,7 +28,7 @@ from jaxcal.recording.formats import aedat4 as aedat4_module
 from jaxcal.recording.formats import event_formats, npz, prophesee_dat, prophesee_raw, text
 
 TWO_SECONDS = 2_000_000
-quick = settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+quick = settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture(scope="module")

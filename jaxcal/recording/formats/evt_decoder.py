@@ -41,13 +41,17 @@ class WordDecoder:
         return _kernels().state_remarks(self._state)
 
     def _words(self, content: bytes | memoryview) -> tuple[np.ndarray, ...]:
+        """What the kernels take; all of it read-only, so that one compiled program serves EVT2 and EVT2.1."""
         if self.encoding == "evt3":
             return (np.frombuffer(content, "<u2"),)
         words = np.frombuffer(content, "<u4")
         if self.encoding == "evt2":
-            return words, np.empty(0, np.uint32)
+            return words, words[:0]
         upper, lower = (0, 1) if self.encoding == "evt21-legacy" else (1, 0)
-        return np.ascontiguousarray(words[upper::2]), np.ascontiguousarray(words[lower::2])
+        halves = np.ascontiguousarray(words[upper::2]), np.ascontiguousarray(words[lower::2])
+        for half in halves:
+            half.flags.writeable = False
+        return halves
 
 
 def _kernels() -> ModuleType:
