@@ -93,10 +93,11 @@ def read_recording(case: Case, folder: Path) -> tuple[list[Detections], ImuRecor
 
 @dataclass
 class Watch:
-    """Marks of one `calibrate_camera_imu`: its phases (through `progress`), every solve, all compilation."""
+    """Marks of one `calibrate_camera_imu`: its phases (through `progress`), every solve (start, stop, CPU seconds), all
+    compilation."""
 
     optimise: list[float] = field(default_factory=list)
-    solves: list[tuple[float, float]] = field(default_factory=list)
+    solves: list[tuple[float, float, float]] = field(default_factory=list)
     compiling: list[tuple[float, float]] = field(default_factory=list)
 
     def progress(self, stage: str, done: int, total: int) -> None:
@@ -129,9 +130,9 @@ class Solves:
     def __call__(self, problem: Any, state: Any, **options: Any) -> SolveResult:
         if self.first is None:
             self.first = (problem, state, options)
-        start = time.perf_counter()
+        start, cpu = time.perf_counter(), time.process_time()
         result = self.engine(problem, state, **options)
-        self.watch.solves.append((start, time.perf_counter()))
+        self.watch.solves.append((start, time.perf_counter(), time.process_time() - cpu))
         return result
 
 
@@ -176,11 +177,11 @@ def run_case(case: Case, folder: Path, repeats: int) -> dict[str, Any]:
 
     cpu = time.process_time()
     first = whole() | {"cpu": time.process_time() - cpu}
-    a, b = watch.solves[0]
+    a, b, cpu = watch.solves[0]
     out: dict[str, Any] = {
         "device": str(jax.devices()[0]),
         "first": first,
-        "first_solve": {"total": b - a, "compile": watch.compile_s(a, b)},
+        "first_solve": {"total": b - a, "cpu": cpu, "compile": watch.compile_s(a, b)},
     }
     if repeats:
         runs = []
@@ -267,12 +268,13 @@ def bench(name: str, duration_s: float, repeats: int, gpu: bool) -> None:
     print(
         f"| {name} solve | {duration_s:g} | {cold['first_solve']['total']:.2f} | {disk['first_solve']['total']:.2f} "
         f"| {solve['wall']:.3f} | {solve['cpu']:.3f} | {steps} iterations; assembly {assembly:.0%}, factorisation "
-        f"{factorisation:.0%}; compile {cold['first_solve']['compile']:.2f} s of cold; cost {solve['cost']:.6g} | |"
+        f"{factorisation:.0%}; cold: compile {cold['first_solve']['compile'] / cold['first_solve']['total']:.0%}, "
+        f"CPU {cold['first_solve']['cpu']:.1f} s; cost {solve['cost']:.6g} | |"
     )
     print(
         f"| {name} whole | {duration_s:g} | {first['total']:.2f} | {disk['first']['total']:.2f} | {warm['total']:.3f} "
-        f"| {warm['cpu']:.3f} | cold: {_shares(first)}; warm: {_shares(warm)}; rms {warm['rms_px']:.4f} px "
-        f"| {disk['peak_mib']:.0f} |",
+        f"| {warm['cpu']:.3f} | cold: {_shares(first)}, CPU {first['cpu']:.1f} s; warm: {_shares(warm)}; "
+        f"rms {warm['rms_px']:.4f} px | {disk['peak_mib']:.0f} |",
     )
     print(
         f"<!-- {name}: {corners:.1f} corners per frame; {disk['device']}; load before {load:.1f}, peak of the cold "

@@ -106,7 +106,7 @@ class StillNoise:
         lines = [
             f"# Noise of a still IMU by Allan variance (jaxcal imu-noise): {source}, {self.duration_s:.0f} s at "
             f"{self.rate_hz:.6g} Hz.",
-            "# Values are root mean squares of the axes; ranges hold the axis' true value with 95 %.",
+            "# Values are root mean squares of the axes; ranges hold the true value with 95 %.",
             *([f"# All densities below are {inflate:g} times what was measured."] if inflate != 1.0 else []),
             *(f"# {note}" for note in self.notes),
         ]
@@ -116,6 +116,7 @@ class StillNoise:
                 whole, axes = getattr(sensor, name), getattr(sensor, f"{name}_axes")
                 limit = "" if whole.seen else "; a safe upper limit, not a measurement"
                 own = ", ".join(f"{axis} {in_words(e)}" for axis, e in zip(AXES, axes, strict=True))
+                own += f"; together {in_words(whole)}"
                 lines += [f"{key}: {values[key]:.4e}  # {unit}{limit}", f"#   measured: {own}"]
             own = ", ".join(f"{axis} {in_words(e)}" for axis, e in zip(AXES, sensor.floor_axes, strict=True))
             lines.append(f"#   {sensor.name} bias instability (Kalibr does not use it), {sensor.unit}: {own}")
