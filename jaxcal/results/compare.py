@@ -235,5 +235,9 @@ def _matched(first: CalibratedRig, second: CalibratedRig) -> tuple[list[tuple[in
 
 
 def _share_frames(first: Calibration, second: Calibration) -> bool:
-    times = [{int(t) for camera in item.cameras for t in camera.detections.timestamps_ns} for item in (first, second)]
+    """Whether most of the frames that one of them saw corners in are the other's too."""
+    times = [
+        {int(t) for camera in item.cameras for t in camera.detections.timestamps_ns[camera.detections.seen_frames]}
+        for item in (first, second)
+    ]
     return len(times[0] & times[1]) > 0.5 * min(len(times[0]), len(times[1]))

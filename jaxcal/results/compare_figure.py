@@ -12,6 +12,7 @@ from jaxcal.results.difference import CameraDifference, RigDifference
 
 _PANEL = (3.7, 3.1)  # inches
 _ARROWS = 12  # across
+_BRIGHTEST = 0.98  # share of the differences where both saw corners that the colours tell apart
 
 
 def write_comparison_figure(difference: RigDifference, path: str | Path) -> None:
@@ -27,7 +28,7 @@ def write_comparison_figure(difference: RigDifference, path: str | Path) -> None
     grid = figure.subplots(rows, columns, squeeze=False)
     for camera, line in zip(difference.cameras, grid, strict=True):
         finite = camera.size_px[:, camera.observed]
-        top = float(np.nanmax(finite)) if np.isfinite(finite).any() else 1.0
+        top = float(np.nanquantile(finite, _BRIGHTEST)) if np.isfinite(finite).any() else 1.0
         for k, axes in enumerate(line):
             if k < len(camera.ranges_m):
                 _draw(figure, axes, camera, k, max(top, 1e-6))
@@ -39,12 +40,13 @@ def write_comparison_figure(difference: RigDifference, path: str | Path) -> None
 
 
 def _draw(figure: Figure, axes: Axes, camera: CameraDifference, k: int, top: float) -> None:
-    """Colours up to `top` px, the largest where both saw corners: beyond, lenses may do anything."""
+    """Colours up to `top` px, and arrows where both saw corners: elsewhere lenses may do anything."""
     x, y = camera.pixels[0, :, 0], camera.pixels[:, 0, 1]
     size = np.ma.masked_invalid(camera.size_px[k])
     shown = axes.pcolormesh(x, y, size, cmap="viridis", vmin=0.0, vmax=top, shading="nearest", rasterized=True)
     step = max(1, len(x) // _ARROWS)
-    u, v = np.nan_to_num(camera.difference_px[k, ::step, ::step]).transpose(2, 0, 1)
+    shown_there = np.where(camera.observed[..., None], np.nan_to_num(camera.difference_px[k]), 0.0)
+    u, v = shown_there[::step, ::step].transpose(2, 0, 1)
     if np.hypot(u, v).max() > 0:
         axes.quiver(x[::step], y[::step], u, v, color="white", angles="xy", width=0.004)
     if not camera.observed.all():

@@ -112,9 +112,12 @@ class CameraDifference:
         )
         if self.agreement == "agree":
             return f"{self.name}: the same lens. {apart} apart where both saw corners, {noise}."
+        cause = "Either it changed between the recordings, or a model, the board or the detector errs in one of them"
+        if self.models[0] != self.models[1]:
+            cause = f"The models differ: {self.models[0]} or {self.models[1]}, or both, do not fit it; or it changed"
         return (
-            f"{self.name}: not the same lens. {apart} apart where both saw corners, {noise}. Either it changed between "
-            "the recordings, or a model, the board or the detector errs in one of them: compare their reports."
+            f"{self.name}: not the same lens. {apart} apart where both saw corners, {noise}. {cause}: compare the "
+            "mean residuals in their reports."
         )
 
     @property

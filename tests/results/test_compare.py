@@ -86,6 +86,10 @@ def test_a_calibration_does_not_differ_from_itself(made: Calibration) -> None:
     assert all(camera.worst_px < 1e-6 for camera in found.cameras)
     assert all(p.difference == pytest.approx(0.0, abs=1e-9) for p in found.parameters)
     assert any("same frames" in note for note in found.notes)
+    camera = made.cameras[0]
+    times = camera.detections.timestamps_ns + 1
+    other = dataclasses.replace(camera, detections=dataclasses.replace(camera.detections, timestamps_ns=times))
+    assert compare(made, dataclasses.replace(made, cameras=(other,)), ranges_m=(np.inf,)).notes[1:] == ()
 
 
 def test_what_noise_makes_of_a_lens_is_called_noise(made: Calibration) -> None:
