@@ -109,6 +109,29 @@ def _runs(events: Stream, longest: int) -> list[tuple[int, list[int], int, int]]
     return runs
 
 
+def libcaer_cmp(events: Stream) -> bytes:
+    """One packet of iniVation's encoding in event_camera_msgs, its time base the first time; runs along columns."""
+    words: list[int] = []
+    rows, k = events.rows(), 0
+    while k < len(rows):
+        t, x, y, p = rows[k]
+        same = [k]
+        while same[-1] + 1 < len(rows) and same[-1] - k < 15:
+            t1, x1, y1, p1 = rows[same[-1] + 1]
+            if (t1, x1, p1) != (t, x, p) or not rows[same[-1]][2] < y1 < y + 16:
+                break
+            same.append(same[-1] + 1)
+        since = t - rows[0][0]
+        words += [since >> 12, 0x1000 | since & 0xFFF, 0x2000 | x]
+        if len(same) == 1:
+            words.append(0x3000 | p << 11 | y)
+        else:
+            valid = sum(1 << rows[n][2] - y for n in same)
+            words += [0x4000 | p << 11 | y, 0x5000 | valid & 0xFF, 0x5000 | valid >> 8]
+        k = same[-1] + 1
+    return np.array(words, "<u2").tobytes()
+
+
 ENCODERS = {
     "evt2": (evt2, "% evt 2.0\n"),
     "evt21": (evt21, "% format EVT21;height=48;width=64;endianness=little\n"),

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from event_encoders import Stream, evt3, stream
+from event_encoders import Stream, evt3, libcaer_cmp, stream
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -154,6 +154,27 @@ def test_packets_of_encoded_events(tmp_path: Path, kind: str, block: int, monkey
         assert np.array_equal(times, T0_NS + (events.t - events.t[0]) * 1000)  # the first one at its packet's time
         assert np.array_equal(np.concatenate([piece.x for piece in pieces]), events.x)
         assert "2 packets of events are missing" in file.remarks()[-1]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_packets_of_inivation_cameras(tmp_path: Path, kind: str) -> None:
+    rng = np.random.default_rng(6)
+    rows = stream(np.sort(rng.integers(0, 90_000, 300)))
+    events = Stream(rows.t, rows.y, rows.x, rows.p)  # runs along columns: a sensor of 48x64
+    path = bag_path(tmp_path, kind)
+    with bag_writer(path, kind) as bag:
+        for k, part in enumerate((slice(0, 120), slice(120, 300))):
+            some = Stream(events.t[part], events.x[part], events.y[part], events.p[part])
+            at = T0_NS + int(some.t[0] - events.t[0]) * 1000
+            content = np.frombuffer(libcaer_cmp(some), np.uint8)
+            fields = {"height": 64, "width": 48, "encoding": "libcaer_cmp", "is_bigendian": False, "events": content}
+            fields |= {"seq": k, "time_base": 1_700_000_000_000_000_000 + int(some.t[0]) * 1000}
+            bag.write("/dvs", at, bag.make("event_camera_msgs/msg/EventPacket", header=bag.header(at), **fields))
+    with EventFile(path) as file:
+        found = file.window(0, 2**62)
+    assert np.array_equal(found.t_ns, T0_NS + (events.t - events.t[0]) * 1000)
+    for name in ("x", "y", "p"):
+        assert np.array_equal(getattr(found, name), getattr(events, name))
 
 
 def test_choice_of_topics(tmp_path: Path) -> None:

@@ -9,8 +9,16 @@ import numpy as np
 
 from jaxcal.errors import CalibrationError
 from jaxcal.recording.bags import Bag, Fields, is_bag
-from jaxcal.recording.formats.contract import EventColumns, EventFormat, EventReader, Triggers, joined_triggers
+from jaxcal.recording.formats.contract import (
+    NO_TRIGGERS,
+    EventColumns,
+    EventFormat,
+    EventReader,
+    Triggers,
+    joined_triggers,
+)
 from jaxcal.recording.formats.evt_decoder import WORD_BYTES, WordDecoder
+from jaxcal.recording.formats.libcaer_cmp import decode_packet
 from jaxcal.recording.formats.streams import Block, StreamReader
 
 _ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
@@ -18,7 +26,7 @@ _PACKET = "event_camera_msgs/msg/EventPacket"
 EVENT_TYPES = (*_ARRAYS, _PACKET)
 # What an EventPacket may hold, of what its drivers write.
 _EVT = ("evt2", "evt21", "evt3")
-_MONO = "mono"
+_MONO, _LIBCAER = "mono", "libcaer_cmp"
 
 _BYTES_PER_EVENT = {True: 3, False: 13}  # of a packet, roughly; of an array
 _EVENTS_PER_BLOCK = 1 << 19
@@ -173,17 +181,16 @@ def _packet(path: Path, fields: Fields, state: _State) -> tuple[EventColumns, Tr
         state.lost += sequence - state.next_packet
     state.next_packet = sequence + 1
     if encoding == _MONO:
-        return _mono(content, time_base_ns), joined_triggers([])
-    if encoding not in _EVT:
+        return _mono(content, time_base_ns), NO_TRIGGERS
+    if encoding not in (*_EVT, _LIBCAER):
         raise CalibrationError(
-            f"{path}: packets of events are encoded as '{encoding}'; known here: {', '.join([*_EVT, _MONO])}. Convert "
-            "them with event_camera_tools."
+            f"{path}: packets of events are encoded as '{encoding}'; known here: "
+            f"{', '.join([*_EVT, _LIBCAER, _MONO])}. Convert them with event_camera_tools."
         )
-    if state.decoder is None:
-        state.decoder = WordDecoder(encoding)
-    whole = len(content) // WORD_BYTES[encoding] * WORD_BYTES[encoding]
-    state.cut += whole < len(content)
-    events, triggers = state.decoder.decode(content[:whole])
+    if encoding == _LIBCAER:
+        events, triggers = decode_packet(content, time_base_ns), NO_TRIGGERS
+    else:
+        events, triggers = _decoded(content, encoding, state)
     if state.offset_ns is None and (len(events) or len(triggers)):
         first = min(int(part.t_ns[0]) for part in (events, triggers) if len(part))
         state.offset_ns = stamp_ns - first
@@ -192,6 +199,14 @@ def _packet(path: Path, fields: Fields, state: _State) -> tuple[EventColumns, Tr
         EventColumns(0, events.t_ns + offset, events.x, events.y, events.p),
         Triggers(triggers.t_ns + offset, triggers.channel, triggers.rising),
     )
+
+
+def _decoded(content: memoryview, encoding: str, state: _State) -> tuple[EventColumns, Triggers]:
+    if state.decoder is None:
+        state.decoder = WordDecoder(encoding)
+    whole = len(content) // WORD_BYTES[encoding] * WORD_BYTES[encoding]
+    state.cut += whole < len(content)
+    return state.decoder.decode(content[:whole])
 
 
 def _mono(content: memoryview, time_base_ns: int) -> EventColumns:
