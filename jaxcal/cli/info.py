@@ -61,7 +61,7 @@ def info(file: str, resolution: tuple[int, int] | None, gap: float, as_json: boo
         click.echo(json.dumps(_as_json(topics, facts), indent=2))
         return
     if topics:
-        click.echo(f"{path}: {len(topics)} topics")
+        click.echo(f"{path}: topics and numbers of messages")
         width = max(len(topic.name) for topic in topics)
         for topic in topics:
             click.echo(f"  {topic.name:<{width}}  {topic.count:>9,}  {topic.kind}")

@@ -1,5 +1,6 @@
 """ROS 1 bags, ROS 2 bags and mcap files: topics, raw messages in order of time, and the few fields we need of them."""
 
+import logging
 import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -7,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxcal.errors import CalibrationError
+
+_log = logging.getLogger(__name__)
 
 _SIGNATURES = (b"#ROSBAG V2.0", b"\x89MCAP0\r\n", b"SQLite format 3\0")
 _SUFFIXES = (".bag", ".mcap", ".db3")
@@ -197,7 +200,12 @@ def _open(path: Path) -> tuple[Any, tuple[type[Exception], ...]]:
         reader = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
         reader.open()
     except errors as error:
-        raise _damaged(path, error) from error
+        inside = [file for suffix in (".mcap", ".db3") for file in path.glob(f"*{suffix}")] if path.is_dir() else []
+        if len(inside) != 1:
+            raise _damaged(path, error) from error
+        # Some recorders leave a metadata.yaml that is incomplete; the one file beside it tells all that it should.
+        _log.warning("%s: metadata.yaml cannot be used (%s); reading %s without it", path, error, inside[0].name)
+        return _open(inside[0])
     return reader, errors
 
 

@@ -212,6 +212,23 @@ def test_damaged_bags_are_named(tmp_path: Path) -> None:
         EventFile(tmp_path / "text.mcap")
 
 
+@pytest.mark.parametrize("kind", ["sqlite", "mcap"])
+def test_incomplete_metadata_of_a_single_file_does_no_harm(
+    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = bag_path(tmp_path, kind)
+    events = stream(np.arange(100) * 10)
+    with bag_writer(path, kind) as bag:
+        write_arrays(bag, events, [100])
+    listing = path / "metadata.yaml"
+    content = yaml.safe_load(listing.read_text())
+    content["rosbag2_bagfile_information"]["storage_identifier"] = ""
+    listing.write_text(yaml.safe_dump(content))
+    with caplog.at_level("WARNING"), EventFile(path) as file:
+        assert np.array_equal(file.window(0, 2**62).x, events.x)
+    assert "metadata.yaml cannot be used" in caplog.text
+
+
 # --- images and IMU --------------------------------------------------------------------------------------------------
 
 GREY = np.arange(12 * 20, dtype=np.uint8).reshape(12, 20)
