@@ -229,22 +229,22 @@ def _walk_note(name: str, unit: str, fits: Sequence[Fit], limit: float, statisti
     length = length_that_shows(target, np.mean([fit.parameters for fit in fits], axis=0), statistics)
     return (
         f"{name}: {statistics.count / statistics.rate_hz:.0f} s are too short to tell its random walk from white noise "
-        f"and bias instability; {limit:.2e} {walk_unit(unit)} is a safe upper limit instead. One of {target:.1e} would "
-        f"show in {_length(length)}."
+        f"and bias instability; {limit:.2e} {walk_unit(unit)}, which covers the latter, is a safe upper limit instead. One of "
+        f"{target:.1e} would show in {_length(length)}."
     )
 
 
 def length_that_shows(walk: float, parameters: np.ndarray, statistics: ClusterStatistics) -> float:
     """How long a still recording (s) of three alike axes must be to show a random walk K of `walk` clearly.
 
-    `parameters` (3,) are N^2, B^2, K^2 as known so far; lengths are told from each other by a factor sqrt(2), from that
-    of `statistics` on. Infinity for more than a day.
+    `parameters` (3,) are N^2, B^2, K^2 as known so far; lengths are tried in steps of a factor sqrt(2) beyond that
+    of `statistics`. Infinity for more than a day.
     """
     model = np.array([parameters[0], parameters[1], walk**2])
     # The fit leaves the shortest cluster times out, so that the rate does not matter: a low one is quick.
     rate = min(statistics.rate_hz, 10.0)
     first = statistics.count / statistics.rate_hz
-    lengths = first * 2.0 ** (0.5 * np.arange(max(1, int(2.0 * np.log2(_DAY_S / first)) + 1)))
+    lengths = first * 2.0 ** (0.5 * np.arange(1, max(1, int(2.0 * np.log2(_DAY_S / first))) + 1))
 
     def shows(length: float) -> bool:
         sigma = np.sqrt(expected_covariance(ClusterStatistics(int(length * rate), rate), model)[2, 2] / 3.0)
@@ -256,7 +256,7 @@ def length_that_shows(walk: float, parameters: np.ndarray, statistics: ClusterSt
 
 def _length(seconds: float) -> str:
     if not np.isfinite(seconds):
-        return "no recording of less than a day"
+        return "more than a day"
     if seconds < 100 * 60:
         return f"about {np.ceil(seconds / 60):.0f} min"
     return f"about {np.ceil(seconds / 1800) / 2:g} h"
