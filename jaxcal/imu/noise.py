@@ -229,8 +229,8 @@ def _walk_note(name: str, unit: str, fits: Sequence[Fit], limit: float, statisti
     length = length_that_shows(target, np.mean([fit.parameters for fit in fits], axis=0), statistics)
     return (
         f"{name}: {statistics.count / statistics.rate_hz:.0f} s are too short to tell its random walk from white noise "
-        f"and bias instability; {limit:.2e} {walk_unit(unit)}, which covers the latter, is a safe upper limit instead. One of "
-        f"{target:.1e} would show in {_length(length)}."
+        f"and bias instability; {limit:.2e} {walk_unit(unit)}, which covers the latter, is a safe upper limit instead. "
+        f"One of {target:.1e} would show in {_length(length)}."
     )
 
 

@@ -120,6 +120,14 @@ def test_a_floor_is_told_from_a_random_walk() -> None:
         assert fit.parameters[2] < SIGNIFICANT * fit.sigma[2]
 
 
+def test_a_sensor_may_do_without_white_noise() -> None:
+    statistics = ClusterStatistics(30_000, 100.0)
+    readings = noisy(np.random.default_rng(7), 30_000, 100.0, 1e-9, 1e-4, axes=1)[0]
+    fit = fit_model(statistics, allan_variance(readings, 100.0, statistics.clusters))
+    assert np.sqrt(fit.parameters[2]) == pytest.approx(1e-4, rel=0.15)
+    assert np.all(fit.parameters[:2] < SIGNIFICANT * fit.sigma[:2])
+
+
 def test_cluster_lengths_are_even_in_the_logarithm() -> None:
     assert cluster_lengths(3000, 10.0).tolist() == [1, 2, 4, 8, 16, 32, 64, 128, 256, 512]
     assert cluster_lengths(3000, 100.0, shortest_s=0.1)[0] == 10
