@@ -1,5 +1,6 @@
 """Event recordings of any format: opened by content, read lazily in windows of time, checked on the way."""
 
+import logging
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -11,6 +12,8 @@ from jaxcal.observations import Events
 from jaxcal.recording.formats import open_reader
 from jaxcal.recording.formats.contract import EventColumns, EventReader, Triggers, unsorted
 from jaxcal.recording.places import split_place
+
+_log = logging.getLogger(__name__)
 
 
 class EventFile:
@@ -158,7 +161,8 @@ class EventFile:
     def windows_ending(self, ends_ns: Iterable[int], start_ns: int | None = None) -> Iterator[tuple[int, Events]]:
         """Consecutive windows that end (exclusively) at the given increasing times, as (end, events).
 
-        The first one starts at `start_ns`, by default at the first event.
+        The first one starts at `start_ns`, by default at the first event. At the end, the reader's remarks are logged
+        as warnings.
         """
         self._known_size()
         # From the file's very start where that is meant, so that each event there is passes the check of its order.
@@ -178,6 +182,8 @@ class EventFile:
             left = waiting[0] if waiting else next(pieces, None)
             if left is not None:
                 raise unsorted(self.path, left.start)
+        for remark in self.remarks():
+            _log.warning("%s: %s", self.path, remark)
 
     def _events(self, pieces: list[EventColumns]) -> Events:
         width, height = self._known_size()

@@ -229,7 +229,11 @@ def test_sensors_of_old_headers(folder: Path) -> None:
     ],
 )
 def test_what_was_cut_short_is_read_up_to_there_and_said(
-    folder: Path, write: Callable[[Path, Stream], Path], cut: int, remark: str
+    folder: Path,
+    write: Callable[[Path, Stream], Path],
+    cut: int,
+    remark: str,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     events = stream(np.arange(100) * 1000)
     path = write(folder / "cut.any", events)
@@ -237,7 +241,9 @@ def test_what_was_cut_short_is_read_up_to_there_and_said(
     with EventFile(path, WIDTH, HEIGHT) as file:
         times = np.concatenate([part.t_ns for part in file.chunks()])
         assert np.array_equal(times, events.t[:99] * 1000)
-    assert re.search(remark, " ".join(file.remarks()))
+        assert re.search(remark, " ".join(file.remarks()))
+        list(file.windows(10_000_000))
+    assert re.search(f"cut.any: {remark}", caplog.text)
 
 
 def test_broken_off_aedat4_is_read_up_to_there_and_said(folder: Path) -> None:
