@@ -76,6 +76,18 @@ def wrapped(before, now, bits, most_back):
     return 1 if now < before else 0
 
 
+@numba.njit(cache=True)
+@no_type_check
+def held(time, now, counted, state):
+    """The time that follows `now`: the new one, or `now` where that has stepped back a little, which may be counted."""
+    if time >= now or now - time > LONGEST_STEP_BACK_US:
+        return time
+    if counted:
+        state[STEPS_BACK] += 1
+        state[LARGEST_STEP_BACK_US] = max(state[LARGEST_STEP_BACK_US], now - time)
+    return now
+
+
 # --- EVT2, EVT2.1 ----------------------------------------------------------------------------------------------------
 
 
@@ -118,11 +130,7 @@ def decode_2(words, valid, state, t_ns, x, y, p, trigger_ns, channel, rising):
                 state[UNTIMED] += 1
                 continue
             time = loops + (high << 6) + ((word >> 22) & 0x3F)
-            if time < now and now - time <= LONGEST_STEP_BACK_US:
-                state[STEPS_BACK] += 1
-                state[LARGEST_STEP_BACK_US] = max(state[LARGEST_STEP_BACK_US], now - time)
-            else:
-                now = time
+            now = held(time, now, True, state)
             if kind == _TRIGGER:
                 trigger_ns[triggers] = now * 1000
                 channel[triggers] = (word >> 8) & 0x1F
@@ -186,28 +194,24 @@ def decode_3(words, state, t_ns, x, y, p, trigger_ns, channel, rising):
     for raw in words:
         word = np.int64(raw)
         kind, content = word >> 12, word & 0xFFF
-        if kind in (_VECT_12, _VECT_8):
-            width = 12 if kind == _VECT_12 else 8
-            if now >= 0 and is_cd:
-                for bit in range(width):
-                    if (content >> bit) & 1:
-                        t_ns[events] = now * 1000
-                        x[events] = base + bit
-                        y[events] = row
-                        p[events] = polarity
-                        events += 1
-            elif now < 0:
+        if kind in (_VECT_12, _VECT_8, _ADDR_X):
+            if kind == _ADDR_X:
+                bits, column, rise = 1, content & 0x7FF, content >> 11
+            else:
+                bits, column, rise = content & (0xFFF if kind == _VECT_12 else 0xFF), base, polarity
+                base += 12 if kind == _VECT_12 else 8
+            if now < 0:
                 state[UNTIMED] += 1
-            base += width
-        elif kind == _ADDR_X:
-            if now >= 0 and is_cd:
-                t_ns[events] = now * 1000
-                x[events] = content & 0x7FF
-                y[events] = row
-                p[events] = content >> 11
-                events += 1
-            elif now < 0:
-                state[UNTIMED] += 1
+                continue
+            while bits and is_cd:
+                if bits & 1:
+                    t_ns[events] = now * 1000
+                    x[events] = column
+                    y[events] = row
+                    p[events] = rise
+                    events += 1
+                bits >>= 1
+                column += 1
         elif kind == _ADDR_Y:
             row = content & 0x7FF
             is_cd = 1
@@ -219,13 +223,7 @@ def decode_3(words, state, t_ns, x, y, p, trigger_ns, channel, rising):
                 high, low = content, 0  # the TIME_LOW that belongs to it comes next
             # The first time is known when both parts are: a TIME_HIGH alone may be 4 ms early.
             if high >= 0 and (now >= 0 or kind == _TIME_LOW):
-                time = loops + (high << 12) + low
-                if time < now and now - time <= LONGEST_STEP_BACK_US:
-                    if kind == _TIME_LOW:
-                        state[STEPS_BACK] += 1
-                        state[LARGEST_STEP_BACK_US] = max(state[LARGEST_STEP_BACK_US], now - time)
-                else:
-                    now = time
+                now = held(loops + (high << 12) + low, now, kind == _TIME_LOW, state)
         elif kind == _VECT_BASE_X:
             base, polarity = content & 0x7FF, content >> 11
         elif kind == _TRIGGER:
