@@ -18,21 +18,28 @@ _FITS = 0.06
 _ROUNDS = 6
 _GOOD_SHARE = 0.7  # of a neighbourhood's corners are taken to be in the right place
 _NEARLY_ALL, _MOST = 0.9, 0.8
+_CLEARLY_BETTER = 0.3  # what another layout's misfit has to be of the stated one's
 _STRAY = 0.2  # so many views may be odd ones, which calibration leaves out
 
 
 @dataclass(frozen=True)
 class _Views:
-    """What each view (F,) says about a layout: can it be judged, does it fit, is it seen from behind?"""
+    """What each view (F,) says about a layout: can it be judged, does it fit, is it seen from behind; the misfit."""
 
     judged: np.ndarray
     fits: np.ndarray
     mirrored: np.ndarray
+    misfit: np.ndarray
 
     @property
     def share(self) -> float:
         """The share of the views that fit, among those that can be judged."""
         return float(self.fits.sum() / max(self.judged.sum(), 1))
+
+    @property
+    def typical(self) -> float:
+        """The median misfit of the views that can be judged."""
+        return float(np.median(self.misfit[self.judged])) if self.judged.any() else np.inf
 
 
 def check_board(name: str, frames: CameraFrames, target: Target) -> list[str]:
@@ -59,7 +66,7 @@ def _check_one(where: str, frame: np.ndarray, pixels: np.ndarray, seen: np.ndarr
     if not judged:
         return []
     if views.share < 1.0 - _STRAY:
-        _explain(where, pixels, seen, board)
+        _explain(where, pixels, seen, board, views.typical)
     mirrored = views.fits & views.mirrored
     if mirrored.sum() > _NEARLY_ALL * views.fits.sum() and views.share >= 0.5:
         return [
@@ -89,8 +96,8 @@ def _check_one(where: str, frame: np.ndarray, pixels: np.ndarray, seen: np.ndarr
     return sentences
 
 
-def _explain(where: str, pixels: np.ndarray, seen: np.ndarray, board: Target) -> None:
-    """Raise CalibrationError when rows of another length explain nearly all views."""
+def _explain(where: str, pixels: np.ndarray, seen: np.ndarray, board: Target, stated_misfit: float) -> None:
+    """Raise CalibrationError when rows of another length explain nearly all views, and far better than the stated."""
     best: tuple[float, int, _Views] | None = None
     few = slice(None, None, max(1, len(pixels) // 20))
     for cols in range(1, _count(board) + 1):
@@ -99,7 +106,8 @@ def _explain(where: str, pixels: np.ndarray, seen: np.ndarray, board: Target) ->
         views = _judge(pixels[few], seen[few], _layout(board, cols))
         if views.judged.any() and (best is None or views.share > best[0]):
             best = (views.share, cols, views)
-    if best is None or best[0] < _MOST:
+    # In small or noisy images the right layout may miss the limit as well, and another meet it by chance.
+    if best is None or best[0] < _MOST or best[2].typical > _CLEARLY_BETTER * stated_misfit:
         return
     _, cols, views = best
     mirrored = (views.fits & views.mirrored).sum() > 0.5 * views.fits.sum()
@@ -170,7 +178,7 @@ def _judge(pixels: np.ndarray, seen: np.ndarray, layout: np.ndarray) -> _Views:
     judged = np.any(usable, axis=1, keepdims=True)[:, 0]
     typical = _median(misfit)
     votes = np.where(usable, np.where(mirrored, 1, -1), 0).sum(axis=1)
-    return _Views(judged, judged & (typical < _FITS), votes > 0)
+    return _Views(judged, judged & (typical < _FITS), votes > 0, typical)
 
 
 def _median(misfit: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from jaxcal.calibration.checks import resolve_models, resolve_names
 from jaxcal.calibration.inertial import InertialData
 from jaxcal.calibration.initial_imu import Alignment, CameraTrack
 from jaxcal.calibration.initial_lens import board_poses, initial_lens
+from jaxcal.calibration.lens_basis import own_parameters
 from jaxcal.calibration.outcome import calibration_from, chain_covariance_and_sentences
 from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.robust import RobustFit, robust_fit
@@ -222,6 +223,7 @@ def _problem(
         free_chain=jnp.ones((grid.intervals + grid.order - 1, 12), dtype=bool),
         free=jnp.asarray(free),
         loss_width=jnp.asarray(1.0),
+        basis=own_parameters(lenses, layout),
         layout=layout,
         order=grid.order,
     )

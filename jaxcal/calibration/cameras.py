@@ -41,7 +41,7 @@ def calibrate_cameras(
     board_warp: bool = False,
     point_offset_sigma_m: float | None = None,
     loss: Loss = "huber",
-    max_steps: int = 100,
+    max_steps: int = 300,
     progress: Progress = no_progress,
 ) -> Calibration:
     """Calibrate cameras jointly from their views of a target; no initial guess is needed.

@@ -35,6 +35,8 @@ _MOST_FINALISTS = 3
 _HUBER_PX = 3.0
 # Corner noise (px) taken for granted until it is known, in the scale of priors alone.
 _FIRST_NOISE_PX = 0.1
+# The share of their usual spread that parameters have at the start.
+_START_SPREAD = 0.3
 # Information on parameters that are held: nothing that corners say comes near.
 _HELD = 1e18
 # Focal lengths tried for the requested model, relative to the one found.
@@ -384,10 +386,14 @@ def _sharpened(fit: Fit, views: Views, start: CameraModel, far: float) -> tuple[
 
 
 def _model_prior(start: CameraModel) -> tuple[np.ndarray, np.ndarray]:
-    """The model's own regularisation, and what it holds."""
-    information = np.array(start.regularisation())
+    """The model's own regularisation, what it holds, and what is usual, more strictly than in the end: of the lenses
+    that do equally well the plainest is the best to start from."""
+    mean, information = np.array(start.parameters), np.array(start.regularisation())
+    for place, name in enumerate(name for part in start.parameter_names for name in part):
+        if name in start.usual_spread:
+            mean[place], information[place] = 0.0, (_START_SPREAD * start.usual_spread[name]) ** -2
     information[list(start.held)] = _HELD
-    return np.asarray(start.parameters), information
+    return mean, information
 
 
 def _fit_model(start: CameraModel, generic: Fit, views: Views, far: float) -> Fit:

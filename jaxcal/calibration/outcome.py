@@ -8,6 +8,7 @@ import numpy as np
 from jaxcal.calibration import observability, outliers, uncertainty
 from jaxcal.calibration.assemble import CameraFrames, split_groups
 from jaxcal.calibration.checks import versions
+from jaxcal.calibration.lens_basis import to_parameters
 from jaxcal.calibration.robust import RobustFit, camera_poses
 from jaxcal.calibration.state import RigState, SharedLayout, camera_model_of, transform
 from jaxcal.cameras import CameraModel
@@ -22,7 +23,7 @@ def chain_covariance_and_sentences(
     """Covariance of shared parameters, marginal covariance of the chain, sentences on what is unobserved."""
     labels = uncertainty.labels_of(names, models, fit.problem.layout)
     covariance, chain, sentences = uncertainty.shared_covariance(
-        fit.result.equations, np.asarray(fit.problem.free), labels
+        fit.result.equations, np.asarray(fit.problem.free), labels, to_parameters(fit.problem.basis, fit.problem.layout)
     )
     # Views that repeat each other's errors were given relative weights; what they are worth together is less still.
     inflation = max(r.inflation for r in fit.redundancy)

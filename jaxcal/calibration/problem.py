@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxcal.calibration import inertial, vision
 from jaxcal.calibration.inertial import InertialData
+from jaxcal.calibration.lens_basis import LensBasis
 from jaxcal.calibration.state import RigState, SharedLayout
 from jaxcal.calibration.target_shape import TargetGeometry, points_by_target, target_points
 from jaxcal.calibration.vision import FramePoses, VisionData
@@ -26,7 +27,8 @@ class RigProblem(eqx.Module):
 
     Without `imu` the chain holds one pose per view (band width zero); with it, spline control points and biases.
     `free_chain` (B,) and `free` (P,) say which coordinates are estimated; the others are held. `loss_width` is the
-    scale of the robust loss in sigmas of a corner; infinity for plain least squares.
+    scale of the robust loss in sigmas of a corner; infinity for plain least squares. `basis` are the directions along
+    which steps of the lenses are counted.
     """
 
     templates: tuple[CameraModel, ...]
@@ -37,6 +39,7 @@ class RigProblem(eqx.Module):
     free_chain: Bool[Array, "K B"]
     free: Bool[Array, " P"]
     loss_width: Float[Array, ""]
+    basis: LensBasis
     layout: SharedLayout = eqx.field(static=True)
     order: int = eqx.field(static=True)
     loss: str = eqx.field(static=True, default="huber")
@@ -54,6 +57,11 @@ class RigProblem(eqx.Module):
 
     def retract(self, state: RigState, chain: Float[Array, "K B"], shared: Float[Array, " P"]) -> RigState:
         """Move along a tangent step."""
+        for columns, members in zip(self.basis, self.layout.groups, strict=True):
+            if columns is not None:
+                for place, camera in enumerate(members):
+                    lens = self.layout.lens(camera)
+                    shared = shared.at[lens].set(columns[place] @ shared[lens])
         return state.retract(self.layout, chain, shared)
 
     def residuals(self, state: RigState) -> Float[Array, " R"]:
@@ -114,7 +122,7 @@ class RigProblem(eqx.Module):
         for group, data in enumerate(self.corners):
             poses = self.poses(state, data)
             frames = vision.linearise_frames(
-                self.templates[group], state, data, poses, group, points, by_target, self.robust
+                self.templates[group], state, data, poses, group, points, by_target, self.robust, self.basis[group]
             )
             window = window.at[poses.start].add(frames.window)
             gradient_window = gradient_window.at[poses.start].add(frames.gradient_window)
@@ -173,11 +181,16 @@ class RigProblem(eqx.Module):
         corner, gradient, cost = equations.corner, equations.gradient_shared, equations.cost
         for group, members in enumerate(self.layout.groups):
             error = state.lenses[group] - self.prior.mean[group]
-            force = jnp.einsum("cij,cj->ci", self.prior.information[group], error)
+            information = self.prior.information[group]
+            force = jnp.einsum("cij,cj->ci", information, error)
             cost = cost + 0.5 * jnp.sum(error * force)
+            columns = self.basis[group]
+            if columns is not None:
+                information = columns.swapaxes(-1, -2) @ information @ columns
+                force = jnp.einsum("cij,ci->cj", columns, force)
             for place, camera in enumerate(members):
                 rows = self.layout.lens(camera)
-                corner = corner.at[rows, rows].add(self.prior.information[group][place])
+                corner = corner.at[rows, rows].add(information[place])
                 gradient = gradient.at[rows].add(force[place])
         return eqx.tree_at(lambda e: (e.corner, e.gradient_shared, e.cost), equations, (corner, gradient, cost))
 

@@ -14,61 +14,104 @@ from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.robust import RobustFit, corner_errors
 from jaxcal.calibration.state import RigState
 from jaxcal.calibration.uncertainty import shared_information
-from jaxcal.estimation import solve
+from jaxcal.estimation import BlockArrow, damped_step, single_threaded_blas, solve
 
 logger = logging.getLogger(__name__)
 
-# How far the restart is from the optimum, in sigmas along every direction of the shared parameters.
+# How far restarts are from the optimum, in sigmas along every direction of the shared parameters: the first, and those
+# that follow in turn where that one met another optimum or strongly bent ground.
 _RESTART_SIGMAS = 10.0
+_MORE_SIGMAS = (3.0, 1.0, 10.0)
+_MOST_RESTARTS = 13
+# So many restarts have to come back: of the first one, and on bent ground.
+_ENOUGH, _ENOUGH_BENT = 1, 4
 # Costs that differ by less than this share are one optimum.
 _SAME_COST = 1e-8
-_RESTARTS = 3
+# So far may the cost at the restart exceed what the quadratic model promises; beyond, the start is nonsense (a lens
+# with a pole in the image, say) and moves nearer.
+_BELIEVABLE = 3.0
+_HALVINGS = 6
 
 
 def confirm_optimum(fit: RobustFit, cameras: Sequence[CameraFrames], *, max_steps: int) -> tuple[RobustFit, list[str]]:
     """Solve again from ten sigmas away; a lower optimum found on the way is taken, and tried in turn.
 
-    Returns the fit to use, and sentences where no restart agreed with it. Deterministic.
+    Where the first restart comes back, that is all. Where it does not, or the cost is far from quadratic between, more
+    follow, near and far. Returns the fit to use, and a sentence where restarts do not agree. Deterministic.
     """
     rng = np.random.default_rng(0)
-    for attempt in range(_RESTARTS):
-        away = _displacement(fit, rng)
-        if away is None:
+    agreed, bent, worse = 0, False, None
+    for attempt in range(_MOST_RESTARTS):
+        sigmas = _RESTART_SIGMAS if attempt == 0 else _MORE_SIGMAS[attempt % len(_MORE_SIGMAS)]
+        force = _displacement(fit, sigmas, rng)
+        if force is None:
             return fit, []
-        start = _moved(fit.problem, fit.state, jnp.asarray(away))
+        start, halved = _left(fit, force)
         result = solve(fit.problem, start, max_steps=max_steps)
         before, after = float(fit.result.equations.cost), float(result.equations.cost)
         logger.info("restart %d: cost %.9g, from %.9g", attempt, after, before)
-        if not np.isfinite(after) or after >= before * (1.0 - _SAME_COST):
-            agrees = after <= before * (1.0 + _SAME_COST)
-            return fit, [] if agrees or not bool(fit.result.converged) else [_another_optimum(before, after)]
-        errors = [np.asarray(e) for e in corner_errors(fit.problem, result.state)]
-        fit = dataclasses.replace(fit, result=result, errors=split_groups(fit.problem.layout, cameras, errors))
-    return fit, [
-        f"Each of {_RESTARTS} restarts found a better solution than the one before: the optimum is not certain. Record "
-        "more views, with more varied tilt and distance."
-    ]
+        if after < before * (1.0 - _SAME_COST):
+            fit = dataclasses.replace(fit, result=result)
+            agreed, bent, worse = 0, True, None
+        elif after <= before * (1.0 + _SAME_COST):
+            agreed += 1
+        else:
+            bent, worse = True, after
+        bent = bent or halved
+        if agreed >= (_ENOUGH_BENT if bent else _ENOUGH):
+            break
+    errors = [np.asarray(e) for e in corner_errors(fit.problem, fit.state)]
+    fit = dataclasses.replace(fit, errors=split_groups(fit.problem.layout, cameras, errors))
+    if agreed or not bool(fit.result.converged):
+        return fit, []
+    return fit, [_uncertain(float(fit.result.equations.cost), worse)]
 
 
-@eqx.filter_jit
-def _moved(problem: RigProblem, state: RigState, shared: Array) -> RigState:
-    return problem.retract(state, jnp.zeros(problem.free_chain.shape), shared)
-
-
-def _another_optimum(before: float, after: float) -> str:
+def _uncertain(cost: float, worse: float | None) -> str:
+    said = "each restart found a better solution than the one before"
+    if worse is not None:
+        said = f"none of the restarts came back to it (cost {worse:.10g} instead of {cost:.10g})"
     return (
-        f"Started from ten sigmas away, the optimisation ends in another, worse place (cost {after:.6g} instead of "
-        f"{before:.6g}): the recording determines the calibration weakly. Record more varied tilt and distance."
+        f"Whether this is the optimum is not certain: {said}. The recording determines the calibration weakly. Record "
+        "more views, with more varied tilt and distance."
     )
 
 
-def _displacement(fit: RobustFit, rng: np.random.Generator) -> np.ndarray | None:
-    """A step of the shared parameters, some sigmas long in each direction; None where directions are not determined."""
+def _left(fit: RobustFit, force: np.ndarray) -> tuple[RigState, bool]:
+    """The state that is away from the optimum by what `force` does to it, or nearer where that is no place to start;
+    and whether it had to be nearer."""
+    before = float(fit.result.equations.cost)
+    for halving in range(_HALVINGS):
+        share = 0.5**halving
+        with single_threaded_blas():
+            start, cost, promised = _moved(fit.problem, fit.result.equations, fit.state, jnp.asarray(share * force))
+        if float(cost) - before <= _BELIEVABLE * float(promised):
+            break
+    logger.info("restart from %g of the way, cost %.9g", share, float(cost))
+    return start, halving > 0
+
+
+@eqx.filter_jit
+def _moved(problem: RigProblem, equations: BlockArrow, state: RigState, force: Array) -> tuple[RigState, Array, Array]:
+    """Push the shared parameters; the chain follows, as far as a quadratic cost tells. The cost there, and the increase
+    that the quadratic promised."""
+    pushed = eqx.tree_at(
+        lambda e: (e.gradient_chain, e.gradient_shared), equations, (0.0 * equations.gradient_chain, -force)
+    )
+    step = damped_step(pushed, jnp.asarray(0.0))
+    moved = problem.retract(state, step.chain, step.shared)
+    return moved, 0.5 * jnp.sum(problem.residuals(moved) ** 2), step.predicted
+
+
+def _displacement(fit: RobustFit, sigmas: float, rng: np.random.Generator) -> np.ndarray | None:
+    """The force on the shared parameters (P,) that moves them by so many sigmas along each direction; None where
+    directions are not determined."""
     free = np.asarray(fit.problem.free)
     values, directions = shared_information(fit.result.equations, free)
     if not len(values) or values.min() <= 0:
         return None
-    sigmas = _RESTART_SIGMAS * rng.choice([-1.0, 1.0], size=len(values)) / np.sqrt(values)
-    step = np.zeros(len(free))
-    step[free] = directions @ sigmas
-    return step
+    # A sigma along direction d is d / sqrt(value); the information turns that into d' sqrt(value), d' the dual of d.
+    dual = np.linalg.inv(directions).T
+    force = np.zeros(len(free))
+    force[free] = dual @ (sigmas * rng.choice([-1.0, 1.0], size=len(values)) * np.sqrt(values))
+    return force

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxcal.calibration import outliers
 from jaxcal.calibration.assemble import CameraFrames, split_groups, stack_weights
+from jaxcal.calibration.lens_basis import told_apart
 from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.redundancy import Redundancy, measure_redundancy
 from jaxcal.calibration.state import RigState
@@ -28,7 +29,10 @@ Reweigh = Callable[[RigProblem, RigState], RigProblem]
 
 @dataclass(frozen=True)
 class RobustFit:
-    """The optimum with what was learnt on the way: per camera errors (F, N, 2) px, inliers (F, N), corner noise px."""
+    """The optimum with what was learnt on the way: per camera errors (F, N, 2) px, inliers (F, N), corner noise px.
+
+    The equations in `result` count lenses in terms of `problem.basis`.
+    """
 
     problem: RigProblem
     result: SolveResult
@@ -86,6 +90,9 @@ def robust_fit(
         problem = _with_weights(problem, cameras, kept, sigmas, redundancy, width)
         if reweigh is not None and result is not None:
             problem = reweigh(problem, state)
+        if result is not None:
+            basis = told_apart(problem.basis, result.equations, np.asarray(problem.free), layout)
+            problem = eqx.tree_at(lambda p: p.basis, problem, basis, is_leaf=lambda leaf: leaf is None)
         result = solve(problem, state, max_steps=max_steps)
         state = result.state
         errors = split_groups(layout, cameras, [np.asarray(e) for e in corner_errors(problem, state)])

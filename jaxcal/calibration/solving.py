@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.calibration.assemble import CameraFrames, round_up, vision_data
+from jaxcal.calibration.lens_basis import own_parameters
 from jaxcal.calibration.poses import Poses
 from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.state import (
@@ -21,7 +22,7 @@ from jaxcal.cameras import CameraModel
 from jaxcal.estimation import SolveResult, solve
 from jaxcal.targets import Target
 
-_VIEW_STEP = 8
+_VIEW_STEP = 16
 
 
 def lens_prior(models: Sequence[CameraModel], layout: SharedLayout, cameras: Sequence[CameraFrames]) -> LensPrior:
@@ -29,7 +30,8 @@ def lens_prior(models: Sequence[CameraModel], layout: SharedLayout, cameras: Seq
 
     Focal lengths are somewhere about the image's longer side (1-sigma that length), the principal point about its
     middle (1-sigma half that length): a thousand times wider than what usable views say, and all there is where views
-    tell nothing (all of them frontal). Further parameters as the models ask (`CameraModel.regularisation`).
+    tell nothing (all of them frontal). Further parameters as the models ask (`CameraModel.regularisation`, and
+    `CameraModel.usual_spread`).
     """
     means, informations = {}, {}
     for c, model in enumerate(models):
@@ -40,6 +42,8 @@ def lens_prior(models: Sequence[CameraModel], layout: SharedLayout, cameras: Seq
         for place, name in enumerate(name for part in model.parameter_names for name in part):
             if name in ("fx", "fy", "cx", "cy"):
                 information[place] += (side if name[0] == "f" else 0.5 * side) ** -2
+            if name in model.usual_spread:
+                information[place] += model.usual_spread[name] ** -2
         informations[c] = np.diag(information)
     return LensPrior(
         mean=tuple(jnp.asarray(np.stack([means[c] for c in members])) for members in layout.groups),
@@ -110,6 +114,7 @@ def camera_problem(
         free_chain=jnp.asarray(free_chain),
         free=jnp.asarray(free),
         loss_width=jnp.asarray(float(loss_width)),
+        basis=own_parameters(models, layout),
         layout=layout,
         order=1,
         loss=loss,

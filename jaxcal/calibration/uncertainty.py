@@ -23,19 +23,22 @@ def _schur(equations: BlockArrow) -> tuple:
 
 
 def shared_covariance(
-    equations: BlockArrow, free: np.ndarray, labels: Sequence[str]
+    equations: BlockArrow, free: np.ndarray, labels: Sequence[str], to_parameters: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Covariance (P, P) of the shared parameters (zero where held), marginal covariance (K, B, B) of the chain blocks,
-    and sentences about directions that the data leave open."""
+    and sentences about directions that the data leave open. `to_parameters` (P, P) where the equations count steps that
+    are not those of the parameters."""
     with single_threaded_blas():
         schur, chain = (np.asarray(part) for part in _schur(equations))
     values, vectors, scale = _scaled_eigen(schur, free)
     weak = values < _UNOBSERVED
-    sentences = [_unobserved_sentence(vectors[:, k], np.asarray(labels)[free]) for k in np.flatnonzero(weak)]
+    back = np.eye(len(schur)) if to_parameters is None else to_parameters
+    open_ones = [_as_parameters(vectors[:, k] * scale, free, back, schur) for k in np.flatnonzero(weak)]
+    sentences = [_unobserved_sentence(direction, np.asarray(labels)[free]) for direction in open_ones]
     inverse = (vectors / np.maximum(values, _UNOBSERVED)) @ vectors.T
     covariance = np.zeros(schur.shape)
     covariance[np.ix_(free, free)] = inverse * scale[:, None] * scale[None, :]
-    return covariance, chain, sentences
+    return back @ covariance @ back.T, chain, sentences
 
 
 def shared_information(equations: BlockArrow, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -52,6 +55,16 @@ def _scaled_eigen(schur: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.n
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])
     return values, vectors, scale
+
+
+def _as_parameters(step: np.ndarray, free: np.ndarray, back: np.ndarray, schur: np.ndarray) -> np.ndarray:
+    """A step of the free coordinates as one of the parameters, each in units of what it does by itself."""
+    full = np.zeros(len(free))
+    full[free] = step
+    inverse = np.linalg.inv(back)
+    alone = np.sqrt(np.maximum(np.einsum("ji,jk,ki->i", inverse, schur, inverse), 0.0))
+    direction = ((back @ full) * alone)[free]
+    return direction / max(float(np.linalg.norm(direction)), 1e-300)
 
 
 def _unobserved_sentence(direction: np.ndarray, labels: np.ndarray) -> str:

@@ -10,6 +10,7 @@ from jaxcal.calibration import initial_imu, solving, spline_setup
 from jaxcal.calibration.assemble import CameraFrames, vision_data
 from jaxcal.calibration.inertial import InertialData
 from jaxcal.calibration.initial_imu import CameraTrack
+from jaxcal.calibration.lens_basis import own_parameters
 from jaxcal.calibration.poses import Poses, inverse
 from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.spline_setup import SplineGrid
@@ -91,6 +92,7 @@ def continuous_problem(
         free_chain=jnp.tile(jnp.arange(12) < 6, (knots, 1)),
         free=jnp.asarray(free),
         loss_width=jnp.asarray(1.0),
+        basis=own_parameters(lenses, layout),
         layout=layout,
         order=_ORDER,
         loss=loss,

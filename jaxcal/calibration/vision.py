@@ -148,11 +148,12 @@ def linearise_frames(
     points: Float[Array, "3 N"],
     by_target: Float[Array, "T 3 N"],
     loss: Callable[[Array], tuple[Array, Array]],
+    basis: Float[Array, "C n n"] | None = None,
 ) -> FrameEquations:
     """Equations of all frames of one group, batch by batch; all frames of a batch are of one camera.
 
     `points` are the target's, `by_target` their derivative by the target's T unknowns; `loss` gives (rho, weight) of
-    squared whitened residuals.
+    squared whitened residuals; `basis`, the directions of each lens along which its derivatives are taken.
     """
     rotation, translation = _camera_poses(state, data, poses)
     cameras, q = state.lenses[group].shape[0], state.lenses[group].shape[1] + 7 + by_target.shape[0]
@@ -163,7 +164,10 @@ def linearise_frames(
 
     def batch(total: tuple[Array, Array, Array], parts: tuple) -> tuple[tuple[Array, Array, Array], tuple]:
         camera, R_cam_rig, (poses, rotation, translation, pixels, weight) = parts
-        reduce = functools.partial(_reduce_corners, template, state.lenses[group][camera], points, by_target, loss)
+        along = None if basis is None else basis[camera]
+        reduce = functools.partial(
+            _reduce_corners, template, state.lenses[group][camera], along, points, by_target, loss
+        )
         gram, cost = jax.vmap(reduce)(rotation, translation, pixels, weight)
         chain, turned = jax.vmap(_lift, in_axes=(0, 0, 0, None))(gram, poses, rotation, R_cam_rig)
         shared, gradient = _shared_equations(gram.sum(axis=0), turned.sum(axis=0), state.lenses[group].shape[1])
@@ -191,7 +195,8 @@ def equations_of_each_frame(
 
     def one(parts: tuple) -> tuple[Array, Array, Array]:
         lens, R_cam_rig, pose, R_cam_target, t_cam_target, pixels, weight = parts
-        gram, _ = _reduce_corners(template, lens, points, by_target, loss, R_cam_target, t_cam_target, pixels, weight)
+        board = R_cam_target, t_cam_target, pixels, weight
+        gram, _ = _reduce_corners(template, lens, None, points, by_target, loss, *board)
         (window, cross, _), turned = _lift(gram, pose, R_cam_target, R_cam_rig)
         shared, _ = _shared_equations(gram, turned, lens.shape[0])
         return shared, cross[0], window[0, :, 0]
@@ -204,6 +209,7 @@ def equations_of_each_frame(
 def _reduce_corners(
     template: CameraModel,
     lens: Float[Array, " n"],
+    along: Float[Array, "n n"] | None,
     points: Float[Array, "3 N"],
     by_target: Float[Array, "T 3 N"],
     loss: Callable[[Array], tuple[Array, Array]],
@@ -237,6 +243,7 @@ def _reduce_corners(
     both = []
     for (by_point, by_lens), error in zip(pulled, residual, strict=True):
         a, b, c = by_point
+        by_lens = by_lens if along is None else along.T @ by_lens
         by_rotation = jnp.stack([y * c - z * b, z * a - x * c, x * b - y * a])  # -by_point hat(rotated)
         by_shape = jnp.einsum("jn,tjn->tn", R_cam_target.T @ by_point, by_target)
         both.append(jnp.concatenate([by_rotation, by_point, by_lens, by_shape, error[None]]))

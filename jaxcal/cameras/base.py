@@ -3,7 +3,8 @@
 import abc
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -36,6 +37,8 @@ class CameraModel(eqx.Module):
     finite derivatives, and `is_valid` says so.
 
     `held` are the places in the parameter vector that are never estimated, because others stand for them.
+    `usual_spread` may name parameters that recordings often leave open, with the 1-sigma of the values that they
+    usually take about those of `from_focal`: far wider than what a good recording says, and all there is in a poor one.
     """
 
     name: ClassVar[str] = ""
@@ -43,6 +46,7 @@ class CameraModel(eqx.Module):
     projection_names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy")
     distortion_names: ClassVar[tuple[str, ...]] = ()
     held: ClassVar[tuple[int, ...]] = ()
+    usual_spread: ClassVar[Mapping[str, float]] = MappingProxyType({})
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

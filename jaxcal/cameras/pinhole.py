@@ -1,5 +1,6 @@
 """Pinhole projection, with a distortion applied on the normalised image plane: what lies in front of the camera."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -11,6 +12,9 @@ from jaxcal.cameras.numerics import at_least, keeps_orientation, length, rises_u
 
 # Closer to the image plane than this angle (rad) nothing is projected: pixels there are a million focal lengths out.
 _RIM = 1e-6
+# Numerator and denominator of a rational lens may nearly cancel, whatever their size.
+_RATIONAL_SPREAD = dict.fromkeys(("k1", "k2", "k3", "k4", "k5", "k6"), 1.0)
+_PRISM_SPREAD = dict.fromkeys(("s1", "s2", "s3", "s4"), 0.03)
 
 
 class PinholeModel(CameraModel):
@@ -101,6 +105,7 @@ class PinholeRational8(PinholeModel):
 
     name: ClassVar[str] = "pinhole-rational8"
     distortion_names: ClassVar[tuple[str, ...]] = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    usual_spread: ClassVar[Mapping[str, float]] = _RATIONAL_SPREAD
 
     def _distort(self, plane: Float[Array, "2"]) -> Float[Array, "2"]:
         return distortions.rational8(plane, self.coefficients)
@@ -114,6 +119,7 @@ class PinholeThinPrism12(PinholeModel):
 
     name: ClassVar[str] = "pinhole-thinprism12"
     distortion_names: ClassVar[tuple[str, ...]] = (*PinholeRational8.distortion_names, "s1", "s2", "s3", "s4")
+    usual_spread: ClassVar[Mapping[str, float]] = {**_RATIONAL_SPREAD, **_PRISM_SPREAD}
 
     def _distort(self, plane: Float[Array, "2"]) -> Float[Array, "2"]:
         return distortions.thin_prism12(plane, self.coefficients)
@@ -127,6 +133,7 @@ class PinholeTilted14(PinholeModel):
 
     name: ClassVar[str] = "pinhole-tilted14"
     distortion_names: ClassVar[tuple[str, ...]] = (*PinholeThinPrism12.distortion_names, "tau_x", "tau_y")
+    usual_spread: ClassVar[Mapping[str, float]] = {**PinholeThinPrism12.usual_spread, "tau_x": 0.05, "tau_y": 0.05}
 
     def _distort(self, plane: Float[Array, "2"]) -> Float[Array, "2"]:
         return distortions.tilted14(plane, self.coefficients)

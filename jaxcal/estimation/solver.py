@@ -12,13 +12,17 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.estimation.block_arrow import BlockArrow
-from jaxcal.estimation.descent import BlockArrowDescent
+from jaxcal.estimation.descent import BlockArrowDescent, BlockStep
 from jaxcal.estimation.problem import BlockArrowProblem, State
 from jaxcal.estimation.threads import single_threaded_blas
 
 _MAX_HISTORY = 256
 _FIRST_DAMPING = 1e-4
 _LARGEST_DAMPING = 1e14
+# Damping that holds back no direction that is determined at all: what still promises little under it is an optimum.
+_HARDLY_DAMPED = 1e-12
+# So often such a step may lead uphill (out of a curved valley) before convergence is told by damped ones alone.
+_MOST_REFUSALS = 3
 _NO_LIMIT = 10**9
 
 
@@ -37,6 +41,8 @@ class _LoopState(eqx.Module):
     raise_by: Float[Array, ""]
     converged: Bool[Array, ""]
     stuck: Bool[Array, ""]
+    probing: Bool[Array, ""]
+    refusals: Int[Array, ""]
     iteration: Int[Array, ""]
     history: Float[Array, " history"]
 
@@ -45,13 +51,13 @@ class BlockArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Levenberg-Marquardt with structured linear algebra and steps on a manifold.
 
     Called through `optimistix.least_squares` with `options={"problem": problem}`, `problem` a `BlockArrowProblem`.
-    Damping after Nielsen (1999), scaled by the diagonal of H. It stops when the accepted state's next step promises a
-    decrease of the cost below `rtol * cost + atol`; the cost of noise-normalised residuals is half a chi-square, so
-    that a promise of 1e-6 is a thousandth of a sigma.
+    Damping after Nielsen (1999), scaled by the diagonal of H. It stops when the accepted state's next step, hardly
+    damped, promises a decrease of the cost below `rtol * cost + atol`; the cost of noise-normalised residuals is half a
+    chi-square, so that a promise of 1e-6 is a thousandth of a sigma.
     """
 
     rtol: float = 1e-11
-    atol: float = 1e-12
+    atol: float = 1e-9
     norm: Callable[[Any], Any] = optx.max_norm
     descent: BlockArrowDescent = BlockArrowDescent()
 
@@ -70,6 +76,8 @@ class BlockArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             raise_by=jnp.array(2.0),
             converged=jnp.array(False),
             stuck=jnp.array(False),
+            probing=jnp.array(False),
+            refusals=jnp.array(0),
             iteration=jnp.array(0),
             history=jnp.full(_MAX_HISTORY, jnp.nan),
         )
@@ -87,26 +95,40 @@ class BlockArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         ratio = jnp.where(jnp.isfinite(state.predicted), decrease / state.predicted, 1.0)
         damping, raise_by = _next_damping(accept, state.first, ratio, state.damping, state.raise_by)
 
-        step, _ = self.descent.step(1.0 / damping, equations)
-        finite = jnp.isfinite(step.predicted)
-        step = jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), step)
-        small = finite & (step.predicted < self.rtol * equations.cost + self.atol)
+        step = self._finite_step(damping, equations)
+        tolerance = self.rtol * equations.cost + self.atol
+        # A damped step promises little where a direction is weak, however far the optimum lies along it: ask again.
+        refusals = state.refusals + (state.probing & ~accept)
+        ask = accept & (step.predicted < tolerance) & (damping > _HARDLY_DAMPED) & (refusals < _MOST_REFUSALS)
+        free = jax.lax.cond(ask, lambda: self._finite_step(jnp.array(_HARDLY_DAMPED), equations), lambda: step)
+        further = ask & (free.predicted >= tolerance)
+        step, damping = _select(further, free, step), jnp.where(further, _HARDLY_DAMPED, damping)
+        small = step.predicted < tolerance
         # A rejected step whose promise drowns in the rounding of the cost is as good as convergence.
         drowned = ~accept & (state.predicted < 1e-13 * equations.cost)
 
         new_state = _LoopState(
             first=jnp.array(False),
             trial=problem.retract(y, step.chain, step.shared),
-            predicted=jnp.where(finite, step.predicted, jnp.nan),
+            predicted=step.predicted,
             equations=equations,
             damping=damping,
             raise_by=raise_by,
             converged=(accept & small) | drowned,
             stuck=damping > _LARGEST_DAMPING,
+            probing=further,
+            refusals=refusals,
             iteration=state.iteration + 1,
             history=state.history.at[jnp.minimum(state.iteration, _MAX_HISTORY - 1)].set(equations.cost),
         )
         return y, new_state, None
+
+    def _finite_step(self, damping: Float[Array, ""], equations: BlockArrow) -> BlockStep:
+        """The damped step; where the matrix is not positive definite none, of which nothing is promised."""
+        step, _ = self.descent.step(1.0 / damping, equations)
+        finite = jnp.isfinite(step.predicted)
+        step = jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), step)
+        return eqx.tree_at(lambda s: s.predicted, step, jnp.where(finite, step.predicted, jnp.nan))
 
     def terminate(
         self, fn: Any, y: State, args: Any, options: dict[str, Any], state: _LoopState, tags: Any

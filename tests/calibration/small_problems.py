@@ -131,6 +131,7 @@ def with_imu(seed: int, order: int) -> tuple[RigProblem, RigState]:
         free_chain=jnp.ones((count, 12), dtype=bool),
         free=jnp.ones(layout.size, dtype=bool),
         loss_width=jnp.asarray(jnp.inf),
+        basis=own_parameters(LENSES, layout),
         layout=layout,
         order=order,
     )
