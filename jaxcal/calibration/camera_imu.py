@@ -4,64 +4,69 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcal.calibration import inertial, initial_imu, solving, spline_setup
+from jaxcal.calibration import extra_imus, imu_results, inertial_noise, initial_imu, solving, spline_setup
 from jaxcal.calibration.assemble import CameraFrames, camera_frames, vision_data
 from jaxcal.calibration.checks import resolve_models, resolve_names
+from jaxcal.calibration.extra_imus import OtherImu
 from jaxcal.calibration.inertial import InertialData
 from jaxcal.calibration.initial_imu import Alignment, CameraTrack
 from jaxcal.calibration.initial_lens import board_poses, initial_lens
 from jaxcal.calibration.lens_basis import own_parameters
 from jaxcal.calibration.outcome import calibration_from, chain_covariance_and_sentences
 from jaxcal.calibration.problem import LensPrior, RigProblem
-from jaxcal.calibration.robust import RobustFit, robust_fit
-from jaxcal.calibration.spline_setup import SplineGrid
+from jaxcal.calibration.robust import robust_fit
+from jaxcal.calibration.spline_setup import BinnedImu, SplineGrid
 from jaxcal.calibration.state import RigState, SharedLayout, flat_target, layout_of
 from jaxcal.calibration.target_shape import geometry_of
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
+from jaxcal.imu import imu_model
 from jaxcal.observations import Detections, ImuRecording
 from jaxcal.progress import Progress, no_progress, track
-from jaxcal.results import Calibration, ImuCalibration
+from jaxcal.results import Calibration
 from jaxcal.targets import Target
 
 # The spline reaches this far beyond the first and last frame, so that time offsets have room to move (s).
 _MARGIN_S = 0.1
 # Frames nearer than this to the spline's ends are left out (s).
 _EDGE_S = 0.01
-# Autocorrelations of IMU residuals below this are taken for noise.
-_CLEARLY_CORRELATED = 0.05
 # Tracks thin frames out to this spacing (s) when those of several cameras are merged.
 _TRACK_STEP_S = 0.004
 
 
 def calibrate_camera_imu(
     detections: Sequence[Detections],
-    imu: ImuRecording,
+    imu: ImuRecording | Sequence[ImuRecording],
     target: Target,
     models: Sequence[str | type[CameraModel]] | None = None,
     *,
+    imu_models: str | Sequence[str] = "calibrated",
+    gravity_magnitude: bool = False,
     cameras: Calibration | None = None,
     names: Sequence[str] | None = None,
     intrinsics: Literal["free", "prior", "held"] = "free",
-    imu_noise: Literal["at least given", "given"] = "at least given",
+    imu_noise: Literal["at least given", "given", "estimated"] = "at least given",
     spline_order: int = 6,
     knot_rate_hz: float | None = None,
     max_steps: int = 60,
     progress: Progress = no_progress,
 ) -> Calibration:
-    """Calibrate cameras and an IMU jointly: lenses, T_cam_imu, time offsets, gravity, biases and trajectory.
+    """Calibrate cameras and IMUs jointly: lenses, T_cam_imu, time offsets, gravity, biases and trajectory.
 
     No initial guess is needed, and cameras need not be synchronised or see the board together. Model: Furgale, Rehder
     and Siegwart, "Unified temporal and spatial calibration for multi-sensor systems", IROS 2013.
 
-    `detections` one per camera, `models` as for `calibrate_cameras`; `cameras` an earlier calibration of the same
-    cameras to start from. `intrinsics`: estimate the lenses freely, under the prior of `cameras`, or hold them.
-    `imu_noise`: 'given' trusts the noise densities; 'at least given' raises them where the residuals are larger, so
-    that sigmas stay honest. `spline_order` 4 to 6 and `knot_rate_hz`, chosen from the IMU's own spectrum by default.
+    `detections` one per camera, `models` as for `calibrate_cameras`; `imu` one recording or several: the first one's
+    frame and clock are the rig's, of each further one T_imu_imu0 and a time offset are estimated. `imu_models` for all
+    or one each: 'calibrated', 'scale-misalignment', 'scale-misalignment-size-effect' (`jaxcal.imu`).
+    `gravity_magnitude` estimates the strength of gravity too, rather than its direction alone. `cameras` an earlier
+    calibration of the same cameras to start from. `intrinsics`: estimate the lenses freely, under the prior of
+    `cameras`, or hold them. `imu_noise`: 'given' trusts the noise densities; 'at least given' raises them where the
+    residuals are larger, so that sigmas stay honest; 'estimated' takes what the residuals show, larger or smaller.
+    `spline_order` 4 to 6 and `knot_rate_hz`, chosen from the first IMU's own spectrum by default.
 
     Raises CalibrationError when frames and IMU do not overlap or do not move together, and as `calibrate_cameras`.
     """
@@ -75,9 +80,13 @@ def calibrate_camera_imu(
     frames = [camera_frames(d, target, name) for d, name in zip(detections, names, strict=True)]
     lenses = _first_lenses(names, detections, models, cameras, frames, target, progress)
 
-    imu_time = (imu.timestamps_ns - imu.timestamps_ns[0]) * 1e-9
-    start = _align_all(names, lenses, frames, target, imu, imu_time)
-    grid = _grid(start, imu_time, imu, spline_order, knot_rate_hz)
+    imus = [imu] if isinstance(imu, ImuRecording) else list(imu)
+    imu_names = _imu_models(imu_models, len(imus))
+    first = imus[0]
+    imu_time = (first.timestamps_ns - first.timestamps_ns[0]) * 1e-9
+    start = _align_all(names, lenses, frames, target, first, imu_time)
+    others = extra_imus.align_others(start.tracks[start.reference], start.alignments[start.reference], imus)
+    grid = _grid(start, imu_time, first, spline_order, knot_rate_hz)
     usable = [
         (t + a.shift_s > grid.start + _EDGE_S) & (t + a.shift_s < grid.stop - _EDGE_S)
         for t, a in zip(start.times, start.alignments, strict=True)
@@ -85,10 +94,12 @@ def calibrate_camera_imu(
     for name, ok in zip(names, usable, strict=True):
         if ok.sum() < 3:
             raise CalibrationError(f"{name}: {ok.sum()} frames lie within the IMU recording; at least 3 are needed.")
-    data, slots, samples = spline_setup.bin_imu(grid, imu_time, imu.gyro_rad_s, imu.accel_m_s2, imu.noise, imu.rate_hz)
-    problem = _problem(lenses, frames, target, start, data, grid, cameras, names, intrinsics)
-    state = _first_state(lenses, problem.layout, start, grid, imu, imu_time)
+    binned = extra_imus.bin_all(grid, imus, [place.shift_s for place in others])
+    layout = layout_of(list(lenses), imus=extra_imus.places_of(imu_names), gravity_size=3 if gravity_magnitude else 2)
+    problem = _problem(lenses, frames, target, start, binned, grid, cameras, names, intrinsics, layout)
+    state = _first_state(lenses, layout, start, others, grid, first, imu_time)
 
+    noise = inertial_noise.NoiseModel(binned, grid, imu_noise)
     fit = robust_fit(
         problem,
         state,
@@ -98,13 +109,15 @@ def calibrate_camera_imu(
         pose_parameters=[0.0] * len(names),
         max_steps=max_steps,
         progress=progress,
-        reweigh=_reweigh_imu(data, grid) if imu_noise == "at least given" else None,
+        reweigh=noise.reweigh,
     )
     covariance, chain, sentences = chain_covariance_and_sentences(fit, names, lenses)
-    result = _imu_calibration(fit, imu, imu_time, data, slots, samples, chain, grid)
+    results = imu_results.imu_calibrations(fit, imus, noise, chain, grid)
     settings = {
         "job": "calibrate_camera_imu",
         "models": [model_name(lens) for lens in lenses],
+        "imu_models": imu_names,
+        "gravity_magnitude": gravity_magnitude,
         "intrinsics": intrinsics,
         "imu_noise": imu_noise,
         "spline_order": spline_order,
@@ -118,10 +131,21 @@ def calibrate_camera_imu(
         usable,
         target,
         covariance=covariance,
-        imu=result,
-        warnings=[*sentences, *_imu_warnings(fit, data)],
+        imus=results,
+        warnings=[*sentences, *noise.warnings(fit)],
         settings=settings,
     )
+
+
+def _imu_models(models: str | Sequence[str], count: int) -> list[str]:
+    names = [models] * count if isinstance(models, str) else list(models)
+    if count == 0:
+        raise CalibrationError("no IMU recording was given; use `calibrate_cameras` for cameras alone.")
+    if len(names) != count:
+        raise CalibrationError(
+            f"`imu_models` names {len(names)} models for {count} IMUs; give one for all or one each."
+        )
+    return [imu_model(name).name for name in names]
 
 
 @dataclass(frozen=True)
@@ -200,13 +224,13 @@ def _problem(
     frames: Sequence[CameraFrames],
     target: Target,
     start: _Start,
-    data: InertialData,
+    binned: Sequence[BinnedImu],
     grid: SplineGrid,
     cameras: Calibration | None,
     names: Sequence[str],
     intrinsics: str,
+    layout: SharedLayout,
 ) -> RigProblem:
-    layout = layout_of(list(lenses))
     free = solving.free_coordinates(lenses, layout)
     if intrinsics == "held":
         for c in range(layout.num_cameras):
@@ -218,9 +242,9 @@ def _problem(
         templates=solving.templates_of(lenses, layout),
         corners=vision_data(layout, frames, weights=[np.ones(f.seen.shape) for f in frames], times=start.times),
         geometry=geometry_of(target),
-        imu=data,
+        imu=InertialData(tuple(b.samples for b in binned), jnp.asarray(grid.start), jnp.asarray(grid.dt)),
         prior=prior,
-        free_chain=jnp.ones((grid.intervals + grid.order - 1, 12), dtype=bool),
+        free_chain=jnp.ones((grid.intervals + grid.order - 1, 6 + 6 * len(binned)), dtype=bool),
         free=jnp.asarray(free),
         loss_width=jnp.asarray(1.0),
         basis=own_parameters(lenses, layout),
@@ -247,6 +271,7 @@ def _first_state(
     lenses: Sequence[CameraModel],
     layout: SharedLayout,
     start: _Start,
+    others: Sequence[OtherImu],
     grid: SplineGrid,
     imu: ImuRecording,
     imu_time: np.ndarray,
@@ -256,7 +281,8 @@ def _first_state(
     inside = (imu_time >= grid.start) & (imu_time <= grid.stop)
     imu_time = imu_time[inside]
     orientation = initial_imu.orientation_track(time, rotation, imu_time, imu.gyro_rad_s[inside] - bias)
-    rotations, positions, biases = spline_setup.first_chain(grid, imu_time, orientation, time, position, bias)
+    rotations, positions = spline_setup.first_chain(grid, imu_time, orientation, time, position)
+    biases = np.concatenate([[*b, 0.0, 0.0, 0.0] for b in (bias, *(place.gyro_bias for place in others[1:]))])
     return RigState(
         lenses=solving.stack_lenses(lenses, layout),
         R_cam_rig=jnp.asarray(np.stack([a.R_cam_imu for a in start.alignments])),
@@ -265,8 +291,12 @@ def _first_state(
         gravity=jnp.asarray(initial_imu.gravity_from(orientation, imu.accel_m_s2[inside])),
         rotations=jnp.asarray(rotations),
         positions=jnp.asarray(positions),
-        biases=jnp.asarray(biases),
+        biases=jnp.tile(jnp.asarray(biases), (len(positions), 1)),
         target=flat_target(layout),
+        imu_parameters=tuple(jnp.asarray(imu_model(imu.model).nominal, dtype=float) for imu in layout.imus),
+        R_imu_rig=jnp.asarray(np.stack([place.R_imu_imu0 for place in others])),
+        t_imu_rig=jnp.zeros((len(others), 3)),
+        imu_shift=jnp.asarray([place.shift_s for place in others]),
     )
 
 
@@ -286,123 +316,3 @@ def _merged_track(start: _Start) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if not keep or time[k] - time[keep[-1]] > _TRACK_STEP_S / 2:
             keep.append(k)
     return time[keep], np.concatenate(rotations)[keep], np.concatenate(positions)[keep]
-
-
-@eqx.filter_jit
-def _whitened_imu(problem: RigProblem, state: RigState) -> jnp.ndarray:
-    assert problem.imu is not None
-    return inertial.imu_residuals(state, problem.imu, problem.order)
-
-
-def _noise_ratio(problem: RigProblem, state: RigState, data: InertialData, grid: SplineGrid) -> np.ndarray:
-    """How much larger than `data` says the noise of gyro and accel is (2,), degrees of freedom of the spline accounted.
-
-    Residuals that hang together over time (a scale error, vibration, jitter of the clock) are worth fewer samples than
-    they number: their noise is raised by the root of the autocorrelation time as well, or they would bend the lenses.
-    """
-    assert problem.imu is not None
-    scale = np.asarray(data.inverse_sigma / problem.imu.inverse_sigma)
-    residuals = (np.asarray(_whitened_imu(problem, state)) * scale)[np.asarray(data.present) > 0]
-    freedom = max(1.0 - (grid.used + grid.order - 1) / len(residuals), 0.1)
-    power = np.mean(residuals**2, axis=0) / freedom
-    inflated = power * np.array([autocorrelation_time(axis) for axis in residuals.T])
-    return np.sqrt(inflated.reshape(2, 3).mean(axis=1))
-
-
-def autocorrelation_time(series: np.ndarray) -> float:
-    """Integrated autocorrelation time, in samples: 1 for white noise (Sokal 1997, eq. 3.16, summed while it is
-    clearly positive)."""
-    series = series - series.mean()
-    spectrum = np.abs(np.fft.rfft(series, 2 * len(series))) ** 2
-    covariance = np.fft.irfft(spectrum)[: len(series) // 2]
-    correlation = covariance[1:] / max(covariance[0], 1e-300)
-    ends = np.flatnonzero(correlation < _CLEARLY_CORRELATED)
-    return float(1.0 + 2.0 * np.sum(correlation[: ends[0] if len(ends) else len(correlation)]))
-
-
-def _reweigh_imu(data: InertialData, grid: SplineGrid):
-    """Raise the IMU's noise to what the residuals show, never below what was given."""
-
-    def reweigh(problem: RigProblem, state: RigState) -> RigProblem:
-        ratio = np.maximum(_noise_ratio(problem, state, data, grid), 1.0)
-        inverse_sigma = data.inverse_sigma / jnp.asarray(np.repeat(ratio, 3))
-        return eqx.tree_at(lambda p: p.imu.inverse_sigma, problem, inverse_sigma)
-
-    return reweigh
-
-
-def _imu_warnings(fit: RobustFit, data: InertialData) -> list[str]:
-    assert fit.problem.imu is not None
-    ratio = np.asarray(data.inverse_sigma / fit.problem.imu.inverse_sigma)[[0, 3]]
-    return [
-        f"The {sensor}'s readings scatter {factor:.1f} times more about the trajectory, or hang together over longer, "
-        f"than imu.yaml's {sensor}_noise_density allows; the larger noise was used. Vibration, a loose mount, a scale "
-        "error of the sensor or a datasheet value do this."
-        for sensor, factor in zip(("gyroscope", "accelerometer"), ratio, strict=True)
-        if factor > 2.0
-    ]
-
-
-@eqx.filter_jit
-def _predicted(problem: RigProblem, state: RigState) -> tuple:
-    from jaxcal.trajectory import PoseSpline
-
-    data = problem.imu
-    assert data is not None
-    times = data.start + (jnp.arange(data.fraction.shape[0])[:, None] + data.fraction) * data.dt
-    spline = PoseSpline(state.rotations, state.positions, data.start, data.dt, problem.order)
-    rotation, position, *_ = spline.evaluate(times.ravel())
-    shape = data.fraction.shape
-    return (
-        inertial.predict_samples(state, data, problem.order),
-        rotation.reshape(*shape, 3, 3),
-        position.reshape(*shape, 3),
-    )
-
-
-def _imu_calibration(
-    fit: RobustFit,
-    imu: ImuRecording,
-    imu_time: np.ndarray,
-    data: InertialData,
-    slots: np.ndarray,
-    samples: np.ndarray,
-    chain_covariance: np.ndarray,
-    grid: SplineGrid,
-) -> ImuCalibration:
-    assert fit.problem.imu is not None
-    at = (slots[:, 0], slots[:, 1])
-    readings, rotation, position = (np.asarray(part)[at] for part in _predicted(fit.problem, fit.state))
-    biases = np.asarray(fit.state.biases)
-    u = np.asarray(data.fraction)[at][:, None]
-    left = slots[:, 0]
-    bias = (1.0 - u) * biases[left] + u * biases[left + 1]
-    knot_std = np.sqrt(np.maximum(np.diagonal(chain_covariance[:, 6:, 6:], axis1=1, axis2=2), 0.0))
-    bias_std = (1.0 - u) * knot_std[left] + u * knot_std[left + 1]
-    sigma = 1.0 / np.asarray(fit.problem.imu.inverse_sigma)
-    noise = imu.noise
-    return ImuCalibration(
-        origin_ns=int(imu.timestamps_ns[0]),
-        t_s=imu_time[samples],
-        gyro_rad_s=imu.gyro_rad_s[samples],
-        accel_m_s2=imu.accel_m_s2[samples],
-        gyro_predicted=readings[:, :3],
-        accel_predicted=readings[:, 3:],
-        gyro_bias=bias[:, :3],
-        accel_bias=bias[:, 3:],
-        gyro_sigma=float(sigma[0]),
-        accel_sigma=float(sigma[3]),
-        position_m=position,
-        rotation=rotation,
-        noise={
-            "gyroscope_noise_density": noise.gyro_noise_density,
-            "gyroscope_random_walk": noise.gyro_random_walk,
-            "accelerometer_noise_density": noise.accel_noise_density,
-            "accelerometer_random_walk": noise.accel_random_walk,
-            "update_rate": imu.rate_hz,
-        },
-        knot_rate_hz=1.0 / grid.dt,
-        spline_order=grid.order,
-        gyro_bias_std=bias_std[:, :3],
-        accel_bias_std=bias_std[:, 3:],
-    )

@@ -108,7 +108,6 @@ def calibrate_cameras(
         joint.usable,
         target,
         covariance=covariance,
-        imu=None,
         warnings=[*look.sentences, *joint.sentences, *restart, *sentences],
         settings=settings,
         with_time=time_offsets,

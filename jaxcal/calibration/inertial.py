@@ -1,13 +1,16 @@
 """IMU samples, the biases' random walk, and the weak motion prior that keeps unobserved knots defined."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxcal.calibration.state import RigState, tangent_basis
-from jaxcal.imu import predict, predict_with_jacobian
-from jaxcal.trajectory import basis_matrix, increments, rotation_at, weights
+from jaxcal.calibration.state import RigState, SharedLayout
+from jaxcal.imu import imu_model, predict_with_jacobian, respond
+from jaxcal.trajectory import Increments, basis_matrix, increments, rotation_at, so3, weights
 
 # Knot intervals are reduced in batches of this many.
 INTERVAL_BATCH = 32
@@ -18,12 +21,12 @@ ACCELERATION_SIGMA = 200.0
 _BIAS_SIGMA = (0.3, 2.0)
 
 
-class InertialData(eqx.Module):
-    """IMU samples binned by knot interval, padded to S per interval.
+class ImuSamples(eqx.Module):
+    """Samples of one IMU binned by knot interval, padded to S per interval.
 
-    `fraction` (I, S) place in the interval; `readings` (I, S, 6) gyro then accel; `present` (I, S) 1 or 0;
-    `inverse_sigma` (6,) of one sample; `walk_sigma` (6,) of the biases over one knot interval; `start`, `dt` of the
-    spline, s; `rate_sigma` rad/s and `acceleration_sigma` m/s^2 of the weak motion prior.
+    `fraction` (I, S) place in the interval when the IMU's clock is `shift` s behind the rig's; `readings` (I, S, 6)
+    gyro then accel; `present` (I, S) 1 or 0; `inverse_sigma` (6,) of one sample; `walk_sigma` (6,) of the biases over
+    one knot interval.
     """
 
     fraction: Float[Array, "I S"]
@@ -31,20 +34,34 @@ class InertialData(eqx.Module):
     present: Float[Array, "I S"]
     inverse_sigma: Float[Array, "6"]
     walk_sigma: Float[Array, "6"]
+    shift: Float[Array, ""]
+
+
+class InertialData(eqx.Module):
+    """The time grid of the trajectory (`start`, `dt`, s), the samples of every IMU, and the weak motion prior:
+    `rate_sigma` rad/s and `acceleration_sigma` m/s^2."""
+
+    samples: tuple[ImuSamples, ...]
     start: Float[Array, ""]
     dt: Float[Array, ""]
     rate_sigma: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(RATE_SIGMA))
     acceleration_sigma: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(ACCELERATION_SIGMA))
 
+    @property
+    def walk_sigma(self) -> Float[Array, " b"]:
+        """Of the biases of all IMUs over one knot interval."""
+        return jnp.concatenate([jnp.zeros(0), *(s.walk_sigma for s in self.samples)])
+
 
 class IntervalEquations(eqx.Module):
-    """Contributions of each knot interval: window of k chain blocks (12 coordinates each), and gravity's direction."""
+    """What one IMU says in each knot interval of a window of k chain blocks (rotation, position, its biases: 12
+    coordinates each) and of s shared coordinates: the IMU's own (parameters, place, time shift), and gravity."""
 
     window: Float[Array, "I k 12 k 12"]
-    cross: Float[Array, "I k 12 2"]
-    shared: Float[Array, "2 2"]
+    cross: Float[Array, "I k 12 s"]
+    shared: Float[Array, "s s"]
     gradient_window: Float[Array, "I k 12"]
-    gradient_shared: Float[Array, "2"]
+    gradient_shared: Float[Array, " s"]
     cost: Float[Array, ""]
 
 
@@ -53,95 +70,178 @@ def _windows(chain: Array, intervals: int, length: int) -> Array:
     return jnp.stack([chain[j : j + intervals] for j in range(length)], axis=1)
 
 
-def linearise_imu(state: RigState, data: InertialData, order: int) -> IntervalEquations:
-    """Equations of all IMU samples."""
-    intervals = data.fraction.shape[0]
+class _Window(eqx.Module):
+    """The chain around one knot interval."""
+
+    first: Float[Array, "*I 3 3"]
+    increments: Increments
+    control: Float[Array, "*I k 3"]
+    bias: Float[Array, "*I k 6"]
+
+
+def _chain_windows(state: RigState, intervals: int, order: int, imu: int) -> _Window:
     chain = increments(state.rotations)
-    gravity_basis = tangent_basis(state.gravity)
-    matrix = basis_matrix(order)
-    no_tail = jnp.zeros(order - 2)
-
-    def sample(u: Array, reading: Array, present: Array, first: Array, window, control: Array, bias: Array) -> Array:
-        point = rotation_at(first, window, u, data.dt, order)
-        second = weights(matrix, u, data.dt, 2)
-        bias_weights = jnp.concatenate([jnp.stack([1.0 - u, u]), no_tail])
-        predicted, by_window, by_gravity = predict_with_jacobian(
-            point, second @ control, second, state.gravity, gravity_basis, bias_weights @ bias, bias_weights
-        )
-        rows = jnp.concatenate([by_window.reshape(6, -1), by_gravity, (predicted - reading)[:, None]], axis=1)
-        return rows * (present * data.inverse_sigma)[:, None]
-
-    def interval(parts: tuple) -> Array:
-        u, reading, present, first, window, control, bias = parts
-        rows = jax.vmap(sample, in_axes=(0, 0, 0, None, None, None, None))(
-            u, reading, present, first, window, control, bias
-        )
-        flat = rows.reshape(-1, rows.shape[-1])
-        return flat.T @ flat
-
-    parts = (
-        data.fraction,
-        data.readings,
-        data.present,
+    return _Window(
         state.rotations[:intervals],
         jax.tree.map(lambda leaf: _windows(leaf, intervals, order - 1), chain),
         _windows(state.positions, intervals, order),
-        _windows(state.biases, intervals, order),
+        _windows(state.biases[:, 6 * imu : 6 * imu + 6], intervals, order),
     )
+
+
+class _Motion(eqx.Module):
+    """Angular velocity and acceleration, and specific force at the rig's origin, stacked (9,), in the rig's frame; and
+    their derivative (9, k, 6) by the window's rotations (right perturbation) and positions."""
+
+    value: Float[Array, "9"]
+    by_window: Float[Array, "9 k 6"]
+    rotation: Float[Array, "3 3"]
+
+
+def _motion(window: _Window, u: Array, dt: Array, gravity: Array, order: int) -> _Motion:
+    def turning(u: Array) -> tuple[Array, Array]:
+        point = rotation_at(window.first, window.increments, u, dt, order)
+        return point.velocity, point.velocity_jacobian
+
+    point = rotation_at(window.first, window.increments, u, dt, order)
+    # Perturbations of control points do not depend on time, so that time derivatives and they change places.
+    (omega, by_omega), (alpha, by_alpha) = jax.jvp(turning, (u,), (1.0 / dt,))
+    second = weights(basis_matrix(order), u, dt, 2)
+    back = point.rotation.T
+    force = back @ (second @ window.control - gravity)
+    by_rotation = jnp.concatenate(
+        [by_omega, by_alpha, jnp.einsum("ij,jkl->ikl", so3.hat(force), point.rotation_jacobian)]
+    )
+    by_position = jnp.concatenate([jnp.zeros((6, order, 3)), back[:, None, :] * second[None, :, None]])
+    value = jnp.concatenate([omega, alpha, force])
+    return _Motion(value, jnp.concatenate([by_rotation, by_position], axis=2), point.rotation)
+
+
+def _responses(state: RigState, layout: SharedLayout, imu: int, value: Array, step: Array) -> Float[Array, "6"]:
+    """Readings without biases, the IMU's own shared coordinates moved by `step` (parameters, then its place)."""
+    model = imu_model(layout.imus[imu].model)
+    R, t = state.R_imu_rig[imu], state.t_imu_rig[imu]
+    if layout.imus[imu].placed:
+        turn, shift = step[model.size : model.size + 3], step[model.size + 3 : model.size + 6]
+        R, t = so3.exp(turn) @ R, t + shift
+    parameters = state.imu_parameters[imu] + step[: model.size]
+    return respond(model, parameters, R, t, value[:3], value[3:6], value[6:])
+
+
+def _sample_rows(
+    state: RigState, layout: SharedLayout, imu: int, data: ImuSamples, dt: Array, order: int
+) -> Callable[[Array, Array, _Window], Array]:
+    """A function from one sample (fraction, reading, window) to its Jacobian rows (6, 12 k + s + 1)."""
+    own = layout.imus[imu]
+    basis = layout.gravity_basis(state.gravity)
+    no_tail = jnp.zeros(order - 2)
+
+    def plain(u: Array, reading: Array, window: _Window) -> Array:
+        """`calibrated` at the rig's origin, in closed form."""
+        point = rotation_at(window.first, window.increments, u, dt, order)
+        second = weights(basis_matrix(order), u, dt, 2)
+        bias_weights = jnp.concatenate([jnp.stack([1.0 - u, u]), no_tail])
+        predicted, by_window, by_gravity = predict_with_jacobian(
+            point, second @ window.control, second, state.gravity, basis, bias_weights @ window.bias, bias_weights
+        )
+        return jnp.concatenate([by_window.reshape(6, -1), by_gravity, (predicted - reading)[:, None]], axis=1)
+
+    def general(u: Array, reading: Array, window: _Window) -> Array:
+        u = u + (state.imu_shift[imu] - data.shift) / dt
+        motion = _motion(window, u, dt, state.gravity, order)
+        bias_weights = jnp.concatenate([jnp.stack([1.0 - u, u]), no_tail])
+
+        def response(value: Array, step: Array) -> Array:
+            return _responses(state, layout, imu, value, step)
+
+        zero = jnp.zeros(own.size - own.placed)
+        by_value, by_step = jax.jacrev(response, argnums=(0, 1))(motion.value, zero)
+        by_pose = jnp.einsum("ij,jkl->ikl", by_value, motion.by_window)
+        by_bias = jnp.eye(6)[:, None, :] * bias_weights[None, :, None]
+        by_window = jnp.concatenate([by_pose, by_bias], axis=2).reshape(6, -1)
+        by_gravity = -by_value[:, 6:] @ motion.rotation.T @ basis
+        columns = [by_window, by_step]
+        if own.placed:
+
+            def value_at(u: Array) -> Array:
+                return _motion(window, u, dt, state.gravity, order).value
+
+            _, rate = jax.jvp(value_at, (u,), (1.0 / dt,))
+            columns.append((by_value @ rate + (window.bias[1] - window.bias[0]) / dt)[:, None])
+        predicted = response(motion.value, zero) + bias_weights @ window.bias
+        return jnp.concatenate([*columns, by_gravity, (predicted - reading)[:, None]], axis=1)
+
+    return general if own.size else plain
+
+
+def linearise_imu(state: RigState, data: InertialData, order: int, layout: SharedLayout, imu: int) -> IntervalEquations:
+    """Equations of all samples of one IMU."""
+    samples = data.samples[imu]
+    intervals = samples.fraction.shape[0]
+    rows_of = _sample_rows(state, layout, imu, samples, data.dt, order)
+
+    def interval(parts: tuple) -> Array:
+        u, reading, present, window = parts
+        rows = jax.vmap(rows_of, in_axes=(0, 0, None))(u, reading, window)
+        flat = (rows * (present[:, None] * samples.inverse_sigma)[..., None]).reshape(-1, rows.shape[-1])
+        return flat.T @ flat
+
+    parts = (samples.fraction, samples.readings, samples.present, _chain_windows(state, intervals, order, imu))
     batches = jax.tree.map(lambda leaf: leaf.reshape(-1, INTERVAL_BATCH, *leaf.shape[1:]), parts)
     gram = jax.lax.map(jax.vmap(interval), batches)
     gram = gram.reshape(intervals, *gram.shape[2:])
     n = 12 * order
     return IntervalEquations(
         window=gram[:, :n, :n].reshape(intervals, order, 12, order, 12),
-        cross=gram[:, :n, n : n + 2].reshape(intervals, order, 12, 2),
-        shared=gram[:, n : n + 2, n : n + 2].sum(axis=0),
+        cross=gram[:, :n, n:-1].reshape(intervals, order, 12, -1),
+        shared=gram[:, n:-1, n:-1].sum(axis=0),
         gradient_window=gram[:, :n, -1].reshape(intervals, order, 12),
-        gradient_shared=gram[:, n : n + 2, -1].sum(axis=0),
+        gradient_shared=gram[:, n:-1, -1].sum(axis=0),
         cost=0.5 * gram[:, -1, -1].sum(),
     )
 
 
-def imu_residuals(state: RigState, data: InertialData, order: int) -> Float[Array, "I S 6"]:
-    """Whitened residuals of all samples; zero where a sample is padding."""
-    readings = predict_samples(state, data, order)
-    return (readings - data.readings) * data.present[..., None] * data.inverse_sigma
+def imu_residuals(
+    state: RigState, data: InertialData, order: int, layout: SharedLayout, imu: int
+) -> Float[Array, "I S 6"]:
+    """Whitened residuals of all samples of one IMU; zero where a sample is padding."""
+    samples = data.samples[imu]
+    readings = predict_samples(state, data, order, layout, imu)
+    return (readings - samples.readings) * samples.present[..., None] * samples.inverse_sigma
 
 
-def predict_samples(state: RigState, data: InertialData, order: int) -> Float[Array, "I S 6"]:
-    """Readings that the trajectory and the biases predict at every sample, in physical units."""
-    intervals = data.fraction.shape[0]
-    chain = increments(state.rotations)
-    matrix = basis_matrix(order)
+def predict_samples(
+    state: RigState, data: InertialData, order: int, layout: SharedLayout, imu: int
+) -> Float[Array, "I S 6"]:
+    """Readings that the trajectory and the biases predict at every sample of one IMU, in physical units."""
+    samples = data.samples[imu]
+    intervals = samples.fraction.shape[0]
+    zero = jnp.zeros(layout.imus[imu].size)
 
-    def sample(u: Array, first: Array, window, control: Array, bias: Array) -> Array:
-        point = rotation_at(first, window, u, data.dt, order)
-        acceleration = weights(matrix, u, data.dt, 2) @ control
-        return predict(point.rotation, point.velocity, acceleration, state.gravity, (1.0 - u) * bias[0] + u * bias[1])
+    def sample(u: Array, window: _Window) -> Array:
+        u = u + (state.imu_shift[imu] - samples.shift) / data.dt
+        motion = _motion(window, u, data.dt, state.gravity, order)
+        bias = (1.0 - u) * window.bias[0] + u * window.bias[1]
+        return _responses(state, layout, imu, motion.value, zero) + bias
 
-    per_interval = jax.vmap(sample, in_axes=(0, None, None, None, None))
-    return jax.vmap(per_interval)(
-        data.fraction,
-        state.rotations[:intervals],
-        jax.tree.map(lambda leaf: _windows(leaf, intervals, order - 1), chain),
-        _windows(state.positions, intervals, order),
-        _windows(state.biases, intervals, 2),
-    )
+    windows = _chain_windows(state, intervals, order, imu)
+    return jax.vmap(jax.vmap(sample, in_axes=(0, None)))(samples.fraction, windows)
 
 
 class ChainPrior(eqx.Module):
     """Contributions of the random walk and the motion prior: diagonal and sub-diagonal blocks, and the gradient."""
 
-    band: Float[Array, "K 3 12 12"]
-    gradient: Float[Array, "K 12"]
+    band: Float[Array, "K 3 B B"]
+    gradient: Float[Array, "K B"]
     cost: Float[Array, ""]
 
 
 def linearise_prior(state: RigState, data: InertialData) -> ChainPrior:
     """Bias random walk (Furgale et al. 2013, sec. III-C), switch-on biases, and the weak motion prior."""
     count = state.positions.shape[0]
-    band = jnp.zeros((count, 3, 12, 12))
-    gradient = jnp.zeros((count, 12))
+    size = 6 + state.biases.shape[1]
+    band = jnp.zeros((count, 3, size, size))
+    gradient = jnp.zeros((count, size))
     rotation_residual, position_residual, walk_residual, switch_on = _prior_residuals(state, data)
 
     chain = increments(state.rotations)
@@ -164,7 +264,7 @@ def linearise_prior(state: RigState, data: InertialData) -> ChainPrior:
     band = band.at[:-1, 1, 6:, 6:].add(-information)
     step = walk_residual / data.walk_sigma
     gradient = gradient.at[1:, 6:].add(step).at[:-1, 6:].add(-step)
-    sigma = _switch_on_sigma()
+    sigma = _switch_on_sigma(state)
     band = band.at[0, 0, 6:, 6:].add(jnp.diag(1.0 / sigma**2))
     gradient = gradient.at[0, 6:].add(switch_on / sigma)
 
@@ -182,8 +282,35 @@ def _prior_residuals(state: RigState, data: InertialData) -> tuple[Array, Array,
     p = state.positions
     position = (p[:-2] - 2.0 * p[1:-1] + p[2:]) / (data.acceleration_sigma * data.dt**2)
     walk = (state.biases[1:] - state.biases[:-1]) / data.walk_sigma
-    return rotation, position, walk, state.biases[0] / _switch_on_sigma()
+    return rotation, position, walk, state.biases[0] / _switch_on_sigma(state)
 
 
-def _switch_on_sigma() -> Float[Array, "6"]:
-    return jnp.repeat(jnp.array(_BIAS_SIGMA), 3)
+def _switch_on_sigma(state: RigState) -> Float[Array, " b"]:
+    return jnp.asarray(np.tile(np.repeat(_BIAS_SIGMA, 3), state.biases.shape[1] // 6))
+
+
+class ModelPrior(eqx.Module):
+    """What is usual of an IMU's parameters and place: information (s, s), gradient and cost."""
+
+    information: Float[Array, "s s"]
+    gradient: Float[Array, " s"]
+    cost: Float[Array, ""]
+
+
+def linearise_model_prior(state: RigState, layout: SharedLayout, imu: int) -> ModelPrior:
+    """Parameters are likely near their nominal values; of its place nothing is known."""
+    own = layout.imus[imu]
+    inverse = jnp.concatenate([_inverse_spread(layout, imu), jnp.zeros(own.size - own.parameters)])
+    residual = model_prior_residuals(state, layout, imu)
+    gradient = jnp.concatenate([residual * inverse[: own.parameters], jnp.zeros(own.size - own.parameters)])
+    return ModelPrior(jnp.diag(inverse**2), gradient, 0.5 * jnp.sum(residual**2))
+
+
+def model_prior_residuals(state: RigState, layout: SharedLayout, imu: int) -> Float[Array, " m"]:
+    """Parameters of one IMU less their nominal values, in units of the usual spread."""
+    nominal = jnp.asarray(imu_model(layout.imus[imu].model).nominal, dtype=float)
+    return (state.imu_parameters[imu] - nominal) * _inverse_spread(layout, imu)
+
+
+def _inverse_spread(layout: SharedLayout, imu: int) -> Float[Array, " m"]:
+    return 1.0 / jnp.asarray(imu_model(layout.imus[imu].model).spread, dtype=float)

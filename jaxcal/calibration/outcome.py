@@ -46,7 +46,7 @@ def calibration_from(
     target: Target,
     *,
     covariance: np.ndarray,
-    imu: ImuCalibration | None,
+    imus: Sequence[ImuCalibration] = (),
     warnings: Sequence[str],
     settings: Mapping[str, Any],
     with_time: bool = True,
@@ -57,7 +57,7 @@ def calibration_from(
     models = [camera_model_of(state, layout, fit.problem.templates, c) for c in range(layout.num_cameras)]
     num_intrinsics = [model.num_intrinsics for model in models]
     blocks, named = uncertainty.named_covariance(
-        names, layout, state, covariance, num_intrinsics, with_imu=imu is not None, with_time=with_time
+        names, layout, state, covariance, num_intrinsics, with_imu=bool(imus), with_time=with_time
     )
     poses = split_groups(layout, cameras, [np.asarray(part) for part in camera_poses(fit.problem, state)])
     T_cam_rig = [transform(R, t) for R, t in zip(np.asarray(state.R_cam_rig), np.asarray(state.t_cam_rig), strict=True)]
@@ -71,14 +71,14 @@ def calibration_from(
                 model=models[c],
                 image_size=frames.detections.image_size,
                 T_cn_cnm1=None if c == 0 else T_cam_rig[c] @ np.linalg.inv(T_cam_rig[c - 1]),
-                T_cam_imu=None if imu is None else T_cam_rig[c],
-                timeshift_cam_imu=None if imu is None else float(np.asarray(state.shift)[c]),
+                T_cam_imu=T_cam_rig[c] if imus else None,
+                timeshift_cam_imu=float(np.asarray(state.shift)[c]) if imus else None,
                 detections=frames.detections,
                 residuals_px=frames.per_corner(errors, np.nan),
                 inlier=frames.per_corner(fit.kept[c], False),
                 corner_sigma_px=fit.sigmas[c],
                 T_cam_target=_per_timestamp(poses[c], frames, usable[c]),
-                timeshift_cam_cam0=float(np.asarray(state.shift)[c]) if with_time and imu is None else None,
+                timeshift_cam_cam0=float(np.asarray(state.shift)[c]) if with_time and not imus else None,
             )
         )
     shape = _target_shape(state, layout)
@@ -111,8 +111,9 @@ def calibration_from(
     return Calibration(
         cameras=tuple(results),
         target=target,
-        gravity=None if imu is None else np.asarray(state.gravity),
-        imu=imu,
+        gravity=np.asarray(state.gravity) if imus else None,
+        imu=imus[0] if imus else None,
+        extra_imus=tuple(imus[1:]),
         blocks=blocks,
         covariance=named,
         convergence=history[np.isfinite(history)],

@@ -72,7 +72,9 @@ class RigProblem(eqx.Module):
             parts.append(jnp.ravel(self._whitened_lens_error(state, group)))
         parts.append(jnp.ravel(state.target.offsets / self.geometry.offset_sigma))
         if self.imu is not None:
-            parts.append(jnp.ravel(inertial.imu_residuals(state, self.imu, self.order)))
+            for i in range(len(self.layout.imus)):
+                parts.append(jnp.ravel(inertial.imu_residuals(state, self.imu, self.order, self.layout, i)))
+                parts.append(inertial.model_prior_residuals(state, self.layout, i))
             parts.append(inertial.prior_residuals(state, self.imu))
         return jnp.concatenate(parts)
 
@@ -138,8 +140,9 @@ class RigProblem(eqx.Module):
                 shared = shared.at[columns[:, None], columns].add(frames.shared[place])
                 gradient = gradient.at[columns].add(frames.gradient_shared[place])
 
-        gravity = jnp.zeros((intervals, self.order, 6, 2))
-        columns = [*(borders[c] for c in range(self.layout.num_cameras)), gravity, border_target]
+        others = self.layout.inertial
+        none = jnp.zeros((intervals, self.order, 6, others.stop - others.start))
+        columns = [*(borders[c] for c in range(self.layout.num_cameras)), none, border_target]
         padding = [(0, 0), (0, 0), (0, self.free_chain.shape[1] - 6)]
         return BlockArrow(
             band=band_from_windows(jnp.pad(window, [*padding, (0, 0), padding[-1]])),
@@ -198,17 +201,24 @@ class RigProblem(eqx.Module):
 def _add_imu(
     equations: BlockArrow, state: RigState, data: InertialData, order: int, layout: SharedLayout
 ) -> BlockArrow:
-    samples = inertial.linearise_imu(state, data, order)
+    """The motion prior, the biases' random walk, and every IMU: its samples, and what is usual of its parameters."""
     prior = inertial.linearise_prior(state, data)
-    width = equations.band.shape[1]
-    band = equations.band + band_from_windows(samples.window)
-    band = band.at[:, : min(3, width)].add(prior.band[:, : min(3, width)])
-    gravity = layout.gravity
-    return BlockArrow(
-        band=band,
-        border=equations.border.at[:, :, gravity].add(chain_from_windows(samples.cross)),
-        corner=equations.corner.at[gravity, gravity].add(samples.shared),
-        gradient_chain=equations.gradient_chain + chain_from_windows(samples.gradient_window) + prior.gradient,
-        gradient_shared=equations.gradient_shared.at[gravity].add(samples.gradient_shared),
-        cost=equations.cost + samples.cost + prior.cost,
-    )
+    width = min(3, equations.band.shape[1])
+    band = equations.band.at[:, :width].add(prior.band[:, :width])
+    border, corner = equations.border, equations.corner
+    gradient_chain, gradient_shared = equations.gradient_chain + prior.gradient, equations.gradient_shared
+    cost = equations.cost + prior.cost
+    for i in range(len(layout.imus)):
+        samples = inertial.linearise_imu(state, data, order, layout, i)
+        usual = inertial.linearise_model_prior(state, layout, i)
+        own, gravity = layout.imu(i), layout.gravity
+        shared = np.r_[own, gravity]
+        # Of a chain block, pose and this IMU's biases.
+        block = np.r_[0:6, 6 + 6 * i : 12 + 6 * i]
+        band = band.at[:, :, block[:, None], block].add(band_from_windows(samples.window))
+        border = border.at[:, block[:, None], shared].add(chain_from_windows(samples.cross))
+        corner = corner.at[shared[:, None], shared].add(samples.shared).at[own, own].add(usual.information)
+        gradient_chain = gradient_chain.at[:, block].add(chain_from_windows(samples.gradient_window))
+        gradient_shared = gradient_shared.at[shared].add(samples.gradient_shared).at[own].add(usual.gradient)
+        cost = cost + samples.cost + usual.cost
+    return BlockArrow(band, border, corner, gradient_chain, gradient_shared, cost)

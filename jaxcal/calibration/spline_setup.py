@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from scipy.interpolate import CubicSpline, PchipInterpolator, make_lsq_spline
 from scipy.spatial.transform import Rotation, Slerp
 
 from jaxcal.calibration.assemble import round_up
-from jaxcal.calibration.inertial import INTERVAL_BATCH, InertialData
+from jaxcal.calibration.inertial import INTERVAL_BATCH, ImuSamples
 from jaxcal.observations import ImuNoise
 
 _RATES_HZ = (10.0, 15.0, 20.0, 30.0, 45.0, 70.0, 100.0)
@@ -90,9 +91,8 @@ def first_chain(
     orientation: np.ndarray,
     position_time_s: np.ndarray,
     position: np.ndarray,
-    gyro_bias: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First control rotations (K, 3, 3), positions (K, 3), biases (K, 6): the curves' values at the control times."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """First control rotations (K, 3, 3) and positions (K, 3): the curves' values at the control times."""
     times = grid.control_times
     clipped = np.clip(times, orientation_time_s[0], orientation_time_s[-1])
     rotations = Slerp(orientation_time_s, Rotation.from_matrix(orientation))(clipped).as_matrix()
@@ -100,38 +100,74 @@ def first_chain(
     gaps = np.max(np.diff(position_time_s), initial=0.0)
     # A cubic spline is smoother, but overshoots across gaps.
     curve = CubicSpline(position_time_s, position) if gaps < 0.3 else PchipInterpolator(position_time_s, position)
-    biases = np.tile(np.concatenate([gyro_bias, np.zeros(3)]), (len(times), 1))
-    return rotations, np.asarray(curve(clipped)), biases
+    return rotations, np.asarray(curve(clipped))
+
+
+@dataclass(frozen=True)
+class BinnedImu:
+    """IMU samples by knot interval: the padded arrays, and for each sample used its (interval, slot), its index in the
+    recording and its time on the IMU's own clock, s."""
+
+    samples: ImuSamples
+    slots: np.ndarray
+    index: np.ndarray
+    time_s: np.ndarray
+
+    def at_shift(self, grid: SplineGrid, shift_s: float) -> "BinnedImu":
+        """The same samples, with the IMU's clock `shift_s` behind the grid's."""
+        if shift_s == float(self.samples.shift):
+            return self
+        old = self.samples
+        readings = np.asarray(old.readings)[self.slots[:, 0], self.slots[:, 1]]
+        fraction, placed, present, slots = _place(grid, self.time_s + shift_s, readings, old.present.shape[1])
+        samples = ImuSamples(
+            fraction, placed, present, old.inverse_sigma, old.walk_sigma, shift=jnp.asarray(float(shift_s))
+        )
+        return BinnedImu(samples, slots, self.index, self.time_s)
 
 
 def bin_imu(
-    grid: SplineGrid, time_s: np.ndarray, gyro: np.ndarray, accel: np.ndarray, noise: ImuNoise, rate_hz: float
-) -> tuple[InertialData, np.ndarray, np.ndarray]:
-    """IMU samples by knot interval. Returns the data, and for each sample used its (interval, slot) and its index."""
-    inside = np.flatnonzero((time_s >= grid.start) & (time_s < grid.stop))
-    place = (time_s[inside] - grid.start) / grid.dt
-    interval = np.minimum(np.floor(place).astype(int), grid.used - 1)
-    first = np.searchsorted(interval, np.arange(grid.intervals))
-    slot = np.arange(len(inside)) - first[interval]
-    slots = round_up(int(slot.max(initial=0)) + 1, 2)
-    fraction = np.zeros((grid.intervals, slots))
-    readings = np.zeros((grid.intervals, slots, 6))
-    present = np.zeros((grid.intervals, slots))
-    fraction[interval, slot] = place - interval
-    readings[interval, slot] = np.concatenate([gyro[inside], accel[inside]], axis=1)
-    present[interval, slot] = 1.0
+    grid: SplineGrid,
+    time_s: np.ndarray,
+    gyro: np.ndarray,
+    accel: np.ndarray,
+    noise: ImuNoise,
+    rate_hz: float,
+    shift_s: float = 0.0,
+) -> BinnedImu:
+    """Bin samples at `time_s` on the IMU's own clock, `shift_s` behind the grid's."""
+    on_grid = time_s + shift_s
+    inside = np.flatnonzero((on_grid >= grid.start) & (on_grid < grid.stop))
+    readings = np.concatenate([gyro[inside], accel[inside]], axis=1)
+    fraction, placed, present, slots = _place(grid, on_grid[inside], readings, 1)
     # A density becomes the noise of one sample by the root of the rate, a random walk's step by the root of the time.
     sample = np.sqrt(rate_hz)
     step = np.sqrt(grid.dt)
-    data = InertialData(
-        fraction=jnp.asarray(fraction),
-        readings=jnp.asarray(readings),
-        present=jnp.asarray(present),
+    samples = ImuSamples(
+        fraction=fraction,
+        readings=placed,
+        present=present,
         inverse_sigma=jnp.asarray(
             np.repeat([1.0 / (noise.gyro_noise_density * sample), 1.0 / (noise.accel_noise_density * sample)], 3)
         ),
         walk_sigma=jnp.asarray(np.repeat([noise.gyro_random_walk * step, noise.accel_random_walk * step], 3)),
-        start=jnp.asarray(grid.start),
-        dt=jnp.asarray(grid.dt),
+        shift=jnp.asarray(float(shift_s)),
     )
-    return data, np.stack([interval, slot], axis=1), inside
+    return BinnedImu(samples, slots, inside, time_s[inside])
+
+
+def _place(
+    grid: SplineGrid, on_grid: np.ndarray, readings: np.ndarray, least: int
+) -> tuple[Array, Array, Array, np.ndarray]:
+    """Fractions (I, S), readings (I, S, 6) and presence (I, S) of samples, and their (interval, slot); S at least
+    `least`."""
+    place = (on_grid - grid.start) / grid.dt
+    interval = np.clip(np.floor(place).astype(int), 0, grid.used - 1)
+    first = np.searchsorted(interval, np.arange(grid.intervals))
+    slot = np.arange(len(on_grid)) - first[interval]
+    shape = (grid.intervals, max(round_up(int(slot.max(initial=0)) + 1, 2), least))
+    fraction, placed, present = np.zeros(shape), np.zeros((*shape, 6)), np.zeros(shape)
+    fraction[interval, slot] = place - interval
+    placed[interval, slot] = readings
+    present[interval, slot] = 1.0
+    return jnp.asarray(fraction), jnp.asarray(placed), jnp.asarray(present), np.stack([interval, slot], axis=1)

@@ -13,14 +13,29 @@ from jaxcal.trajectory import so3
 
 
 @dataclass(frozen=True)
+class ImuPlace:
+    """What is shared of one IMU: the number of its model's parameters, and, where it is not the rig's own frame, its
+    place T_imu_rig and its time shift."""
+
+    model: str
+    parameters: int
+    placed: bool
+
+    @property
+    def size(self) -> int:
+        return self.parameters + 7 * self.placed
+
+
+@dataclass(frozen=True)
 class SharedLayout:
     """Where each camera's parameters stand in the tangent vector of the shared parameters.
 
     Cameras are gathered in groups of equal model, so that one compiled projection serves a group; `groups[g]` lists
     its cameras, `sizes[c]` the number of lens parameters of camera c. The vector holds, camera by camera, the lens
-    parameters, T_cam_rig (rotation, translation), the time shift; then the direction of gravity (2); then the target:
-    T_target_board of every board but the first (6 each), the warp (2 where it is estimated), and the offsets of the
-    points (3 each, where they are).
+    parameters, T_cam_rig (rotation, translation), the time shift; then, IMU by IMU, the parameters of its model and, of
+    all but the first, T_imu_rig and the time shift; then the direction of gravity (2), or all of it (3); then the
+    target: T_target_board of every board but the first (6 each), the warp (2 where it is estimated), and the offsets of
+    the points (3 each, where they are).
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -28,6 +43,8 @@ class SharedLayout:
     extra_boards: int = 0
     warp: bool = False
     offsets: int = 0
+    imus: tuple[ImuPlace, ...] = ()
+    gravity_size: int = 2
 
     @property
     def num_cameras(self) -> int:
@@ -35,7 +52,8 @@ class SharedLayout:
 
     @property
     def size(self) -> int:
-        return sum(self.sizes) + 7 * self.num_cameras + 2 + self.target_size
+        inertial = sum(imu.size for imu in self.imus) + self.gravity_size
+        return sum(self.sizes) + 7 * self.num_cameras + inertial + self.target_size
 
     @property
     def target_size(self) -> int:
@@ -58,10 +76,24 @@ class SharedLayout:
     def shift(self, camera: int) -> int:
         return self.lens(camera).stop + 6
 
+    def imu(self, number: int) -> slice:
+        """The parameters, place and time shift of one IMU."""
+        first = self.start(self.num_cameras) + sum(imu.size for imu in self.imus[:number])
+        return slice(first, first + self.imus[number].size)
+
+    @property
+    def inertial(self) -> slice:
+        """All IMUs, and gravity."""
+        return slice(self.start(self.num_cameras), self.size - self.target_size)
+
     @property
     def gravity(self) -> slice:
         stop = self.size - self.target_size
-        return slice(stop - 2, stop)
+        return slice(stop - self.gravity_size, stop)
+
+    def gravity_basis(self, gravity: Float[Array, "3"]) -> Float[Array, "3 g"]:
+        """Directions in which gravity may move: two across it, or all three."""
+        return tangent_basis(gravity) if self.gravity_size == 2 else jnp.eye(3)
 
     @property
     def target(self) -> slice:
@@ -76,12 +108,19 @@ class SharedLayout:
 
 
 def layout_of(
-    models: list[CameraModel], *, extra_boards: int = 0, warp: bool = False, offsets: int = 0
+    models: list[CameraModel],
+    *,
+    extra_boards: int = 0,
+    warp: bool = False,
+    offsets: int = 0,
+    imus: tuple[ImuPlace, ...] = (),
+    gravity_size: int = 2,
 ) -> SharedLayout:
     """Group cameras by their model class; `offsets` is the number of points that may move, or 0."""
     classes = list(dict.fromkeys(type(model) for model in models))
     groups = tuple(tuple(c for c, model in enumerate(models) if type(model) is cls) for cls in classes)
-    return SharedLayout(groups, tuple(model.num_parameters for model in models), extra_boards, warp, offsets)
+    sizes = tuple(model.num_parameters for model in models)
+    return SharedLayout(groups, sizes, extra_boards, warp, offsets, imus, gravity_size)
 
 
 class TargetState(eqx.Module):
@@ -125,8 +164,10 @@ class RigState(eqx.Module):
 
     `lenses[g]` (C_g, n_g) lens parameters of the cameras of group g; `R_cam_rig` (C, 3, 3), `t_cam_rig` (C, 3);
     `shift` (C,) s, rig time = camera time + shift; `gravity` (3,) m/s^2 in the target frame; chain: `rotations`
-    (K, 3, 3) and `positions` (K, 3) of T_target_rig (poses of views, or control points), `biases` (K, 6) gyro then
-    accel (K, 0 without IMU); `target` what is not known of the target.
+    (K, 3, 3) and `positions` (K, 3) of T_target_rig (poses of views, or control points), `biases` (K, 6 M) gyro then
+    accel of each of the M IMUs; `target` what is not known of the target. Of each IMU its model's parameters,
+    `R_imu_rig`, `t_imu_rig`, and `imu_shift` s, rig time = IMU time + shift; the first one's frame and clock are the
+    rig's.
     """
 
     lenses: tuple[Float[Array, "_ _"], ...]
@@ -138,6 +179,10 @@ class RigState(eqx.Module):
     positions: Float[Array, "K 3"]
     biases: Float[Array, "K b"]
     target: TargetState
+    imu_parameters: tuple[Float[Array, "_"], ...] = ()
+    R_imu_rig: Float[Array, "M 3 3"] = eqx.field(default_factory=lambda: jnp.zeros((0, 3, 3)))
+    t_imu_rig: Float[Array, "M 3"] = eqx.field(default_factory=lambda: jnp.zeros((0, 3)))
+    imu_shift: Float[Array, " M"] = eqx.field(default_factory=lambda: jnp.zeros(0))
 
     def retract(self, layout: SharedLayout, chain: Float[Array, "K B"], shared: Float[Array, " P"]) -> "RigState":
         """Move along a tangent step: rotations of the chain on the right, those of the cameras on the left."""
@@ -149,17 +194,31 @@ class RigState(eqx.Module):
         poses = jnp.stack([shared[layout.pose(c)] for c in cameras])
         shifts = jnp.stack([shared[layout.shift(c)] for c in cameras])
         exp = jax.vmap(so3.exp)
-        gravity = self.gravity + tangent_basis(self.gravity) @ shared[layout.gravity]
+        gravity = self.gravity + layout.gravity_basis(self.gravity) @ shared[layout.gravity]
+        if layout.gravity_size == 2:
+            gravity = gravity * (jnp.linalg.norm(self.gravity) / jnp.linalg.norm(gravity))
+        steps = [shared[layout.imu(i)] for i in range(len(layout.imus))]
+        places = [
+            step[imu.parameters :] if imu.placed else jnp.zeros(7) for step, imu in zip(steps, layout.imus, strict=True)
+        ]
+        moved = jnp.stack(places) if places else jnp.zeros((0, 7))
         return RigState(
             lenses=lenses,
             R_cam_rig=exp(poses[:, :3]) @ self.R_cam_rig,
             t_cam_rig=self.t_cam_rig + poses[:, 3:],
             shift=self.shift + shifts,
-            gravity=gravity * (jnp.linalg.norm(self.gravity) / jnp.linalg.norm(gravity)),
+            gravity=gravity,
             rotations=self.rotations @ exp(chain[:, :3]),
             positions=self.positions + chain[:, 3:6],
             biases=self.biases + chain[:, 6:],
             target=self.target.retract(layout, shared[layout.target]) if layout.target_size else self.target,
+            imu_parameters=tuple(
+                values + step[: imu.parameters]
+                for values, step, imu in zip(self.imu_parameters, steps, layout.imus, strict=True)
+            ),
+            R_imu_rig=exp(moved[:, :3]) @ self.R_imu_rig,
+            t_imu_rig=self.t_imu_rig + moved[:, 3:6],
+            imu_shift=self.imu_shift + moved[:, 6],
         )
 
 

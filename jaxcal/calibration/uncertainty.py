@@ -6,9 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcal.calibration.state import RigState, SharedLayout, tangent_basis
+from jaxcal.calibration.state import RigState, SharedLayout
 from jaxcal.cameras import CameraModel
 from jaxcal.estimation import BlockArrow, factorise, single_threaded_blas
+from jaxcal.imu import imu_model
 
 # Eigenvalues of the information matrix, scaled to unit diagonal, below which a direction counts as unobserved.
 _UNOBSERVED = 1e-11
@@ -83,7 +84,10 @@ def labels_of(names: Sequence[str], models: Sequence[CameraModel], layout: Share
     for name, model in zip(names, models, strict=True):
         lens = [label for part in model.parameter_names for label in part]
         labels += [f"{name} {label}" for label in [*lens, *pose, "time shift"]]
-    labels += ["gravity direction 1", "gravity direction 2"]
+    for number, imu in enumerate(layout.imus):
+        own = imu_model(imu.model).labels() + ([*pose, "time shift"] if imu.placed else [])
+        labels += [f"imu{number} {label}" for label in own]
+    labels += [f"gravity {axis}" for axis in ("direction 1", "direction 2", "z")[: layout.gravity_size]]
     labels += [f"board {b + 1} {label}" for b in range(layout.extra_boards) for label in pose]
     labels += ["board warp x", "board warp y"] if layout.warp else []
     return labels + [f"point {i} offset {a}" for i in range(layout.offsets) for a in "xyz"]
@@ -129,7 +133,16 @@ def named_covariance(
             rows.append(identity[[layout.shift(c)]])
     if with_imu:
         blocks.append(("gravity", 3))
-        rows.append(np.asarray(tangent_basis(state.gravity)) @ identity[layout.gravity])
+        rows.append(np.asarray(layout.gravity_basis(state.gravity)) @ identity[layout.gravity])
+    for number, imu in enumerate(layout.imus):
+        own = identity[layout.imu(number)]
+        for block, entries in imu_model(imu.model).blocks:
+            blocks.append((f"imu{number}.{block}", len(entries)))
+            rows.append(own[: len(entries)])
+            own = own[len(entries) :]
+        if imu.placed:
+            blocks += [(f"imu{number}.T_imu_imu0", 6), (f"imu{number}.timeshift_imu_imu0", 1)]
+            rows += [own[:6], own[6:]]
     start = layout.target.start
     for b in range(layout.extra_boards):
         blocks.append((f"target.T_target_board{b + 1}", 6))

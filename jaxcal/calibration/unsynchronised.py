@@ -89,7 +89,7 @@ def continuous_problem(
         geometry=geometry_of(target) if offset_sigma_m is None else geometry_of(target, offset_sigma_m),
         imu=_motion_prior(grid),
         prior=solving.lens_prior(lenses, layout, cameras),
-        free_chain=jnp.tile(jnp.arange(12) < 6, (knots, 1)),
+        free_chain=jnp.ones((knots, 6), dtype=bool),
         free=jnp.asarray(free),
         loss_width=jnp.asarray(1.0),
         basis=own_parameters(lenses, layout),
@@ -98,7 +98,7 @@ def continuous_problem(
         loss=loss,
     )
     time, R, p = _merged(tracks, shift, rotation, arms)
-    rotations, positions, biases = spline_setup.first_chain(grid, time, R, time, p, np.zeros(3))
+    rotations, positions = spline_setup.first_chain(grid, time, R, time, p)
     state = RigState(
         lenses=solving.stack_lenses(lenses, layout),
         R_cam_rig=jnp.asarray(np.stack(rotation)),
@@ -107,7 +107,7 @@ def continuous_problem(
         gravity=jnp.array([0.0, 0.0, -1.0]),
         rotations=jnp.asarray(rotations),
         positions=jnp.asarray(positions),
-        biases=jnp.asarray(biases),
+        biases=jnp.zeros((knots, 0)),
         target=flat_target(layout),
     )
     return Unsynchronised(problem, state, usable, grid)
@@ -140,13 +140,8 @@ def _grid(tracks: Sequence[CameraTrack], shift: Sequence[float]) -> SplineGrid:
 
 def _motion_prior(grid: SplineGrid) -> InertialData:
     """No IMU samples: only the weak prior that bridges the time between frames."""
-    shape = (grid.intervals, 2)
     return InertialData(
-        fraction=jnp.zeros(shape),
-        readings=jnp.zeros((*shape, 6)),
-        present=jnp.zeros(shape),
-        inverse_sigma=jnp.ones(6),
-        walk_sigma=jnp.ones(6),
+        samples=(),
         start=jnp.asarray(grid.start),
         dt=jnp.asarray(grid.dt),
         rate_sigma=jnp.asarray(_RATE_SIGMA),

@@ -13,8 +13,8 @@ from jaxcal.cameras.numerics import at_least, keeps_orientation, length, rises_u
 # Closer to the image plane than this angle (rad) nothing is projected: pixels there are a million focal lengths out.
 _RIM = 1e-6
 # Numerator and denominator of a rational lens may nearly cancel, whatever their size.
-_RATIONAL_SPREAD = dict.fromkeys(("k1", "k2", "k3", "k4", "k5", "k6"), 1.0)
-_PRISM_SPREAD = dict.fromkeys(("s1", "s2", "s3", "s4"), 0.03)
+_RATIONAL_SPREAD: Mapping[str, float] = dict.fromkeys(("k1", "k2", "k3", "k4", "k5", "k6"), 1.0)
+_PRISM_SPREAD: Mapping[str, float] = dict.fromkeys(("s1", "s2", "s3", "s4"), 0.03)
 
 
 class PinholeModel(CameraModel):

@@ -57,7 +57,7 @@ class BlockArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """
 
     rtol: float = 1e-11
-    atol: float = 1e-9
+    atol: float = 1e-12
     norm: Callable[[Any], Any] = optx.max_norm
     descent: BlockArrowDescent = BlockArrowDescent()
 

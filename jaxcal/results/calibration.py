@@ -89,7 +89,11 @@ class ImuCalibration:
     included; `gyro_bias`, `accel_bias` (N, 3) the biases there, `gyro_bias_std`, `accel_bias_std` (N, 3) their 1-sigma
     (or None); `gyro_sigma`, `accel_sigma` the discrete noise assumed, rad/s and m/s^2; `noise` the densities stated, by
     the names of Kalibr's `imu.yaml`. `position_m` (N, 3) and
-    `rotation` (N, 3, 3) are the IMU's pose in the target frame (T_target_imu).
+    `rotation` (N, 3, 3) are the pose of the first IMU in the target frame (T_target_imu0).
+
+    `model` is Kalibr's name of the IMU model and `parameters` its matrices by Kalibr's names. Of further IMUs also
+    `T_imu_imu0` (4, 4), mapping points from the first one's frame, and `timeshift_imu_imu0` (s, t_imu0 = t_imu +
+    shift). `noise_ratio` is the noise that the residuals show over the stated one (gyro, accel), whether or not used.
     """
 
     origin_ns: int
@@ -109,6 +113,11 @@ class ImuCalibration:
     spline_order: int
     gyro_bias_std: np.ndarray | None = None
     accel_bias_std: np.ndarray | None = None
+    model: str = "calibrated"
+    parameters: Mapping[str, np.ndarray] = field(default_factory=dict)
+    T_imu_imu0: np.ndarray | None = None
+    timeshift_imu_imu0: float | None = None
+    noise_ratio: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -118,7 +127,8 @@ class Calibration:
     `blocks` names the rows of `covariance` (P, P), in order, with their sizes: 'cam0.intrinsics',
     'cam0.distortion', 'cam1.T_cn_cnm1' (rotation x y z in rad, then translation x y z in m, both as a perturbation on
     the left: R = Exp(dr) R0, t = t0 + dt, in the frame of the camera), 'cam0.T_cam_imu' likewise,
-    'cam0.timeshift_cam_imu' (s), 'cam1.timeshift_cam_cam0' (s), 'gravity' (m/s^2, target frame),
+    'cam0.timeshift_cam_imu' (s), 'cam1.timeshift_cam_cam0' (s), 'gravity' (m/s^2, target frame), 'imu0.M_accel' and
+    other parameters of an IMU's model, 'imu1.T_imu_imu0' (as the other poses), 'imu1.timeshift_imu_imu0' (s),
     'target.T_target_board1' (as the other poses), 'target.warp' (m), 'target.offsets' (m, x y z of each point). Held
     parameters have zero variance.
 
@@ -139,6 +149,12 @@ class Calibration:
     versions: Mapping[str, str] = field(default_factory=dict)
     converged: bool = True
     target_shape: TargetShape | None = None
+    extra_imus: tuple[ImuCalibration, ...] = ()
+
+    @property
+    def imus(self) -> tuple[ImuCalibration, ...]:
+        """All IMUs, the one that defines the rig's frame first."""
+        return () if self.imu is None else (self.imu, *self.extra_imus)
 
     @property
     def target_points(self) -> np.ndarray:

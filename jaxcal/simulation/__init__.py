@@ -11,6 +11,7 @@ _EXPORTS = {
     "SimulatedRig": "rig",
     "paper_rig": "rig",
     "swinging_motion": "rig",
+    "ImuTruth": "measurements",
     "simulate_detections": "measurements",
     "simulate_imu": "measurements",
     "EventSensor": "event_sensor",
@@ -22,6 +23,7 @@ __all__ = [
     "EventSensor",
     "EventSensorConfig",
     "Imaging",
+    "ImuTruth",
     "Motion",
     "SimulatedCamera",
     "SimulatedRig",
@@ -34,7 +36,7 @@ __all__ = [
 
 if TYPE_CHECKING:
     from jaxcal.simulation.event_sensor import EventSensor, EventSensorConfig
-    from jaxcal.simulation.measurements import simulate_detections, simulate_imu
+    from jaxcal.simulation.measurements import ImuTruth, simulate_detections, simulate_imu
     from jaxcal.simulation.motion import Motion
     from jaxcal.simulation.recordings import write_recording
     from jaxcal.simulation.rig import Imaging, SimulatedCamera, SimulatedRig, paper_rig, swinging_motion

@@ -1,5 +1,8 @@
 """Measurements without images: projected corners with pixel noise, and IMU samples with noise and biases."""
 
+import functools
+from dataclasses import dataclass, field
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,8 +11,9 @@ from jaxtyping import Array, Bool, Float
 
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
+from jaxcal.imu import imu_model, respond
 from jaxcal.observations import Detections, ImuRecording
-from jaxcal.simulation.motion import poses_at, rates
+from jaxcal.simulation.motion import angular_accelerations, poses_at, rates
 from jaxcal.simulation.rig import SimulatedCamera, SimulatedRig
 from jaxcal.targets import AprilGrid, Charuco
 
@@ -84,36 +88,60 @@ def _whole_features(rig: SimulatedRig, seen: np.ndarray) -> np.ndarray:
     return whole
 
 
-def simulate_imu(rig: SimulatedRig, noisy: bool = True) -> ImuRecording:
+@dataclass(frozen=True)
+class ImuTruth:
+    """An IMU that is not simply `calibrated` at the rig's origin: its `model` with `parameters` (m,) (nominal ones by
+    default), its place T_imu_imu0 (4, 4) and clock (s, t_imu0 = t_imu + shift). `number` picks its noise."""
+
+    model: str = "calibrated"
+    parameters: np.ndarray | None = None
+    T_imu_imu0: np.ndarray = field(default_factory=lambda: np.eye(4))
+    timeshift_imu_imu0: float = 0.0
+    number: int = 0
+
+
+def simulate_imu(rig: SimulatedRig, noisy: bool = True, truth: ImuTruth | None = None) -> ImuRecording:
     """IMU samples over the rig's duration, timestamps on the IMU's clock.
 
-    gyro = omega + b_g + n_g,  accel = R_imu_target (a - g) + b_a + n_a, with white noise of standard deviation
-    density * sqrt(rate) per sample and biases that walk by random_walk / sqrt(rate) per sample (the usual
-    discretisation of the continuous-time densities, e.g. Kalibr's "IMU Noise Model"). With `noisy` False only the
-    constant initial biases are added.
+    gyro = omega + b_g + n_g,  accel = R_imu_target (a - g) + b_a + n_a, or what `truth` says of another IMU, with white
+    noise of standard deviation density * sqrt(rate) per sample and biases that walk by random_walk / sqrt(rate) per
+    sample (the usual discretisation of the continuous-time densities, e.g. Kalibr's "IMU Noise Model"). With `noisy`
+    False only the constant initial biases are added.
     """
+    truth = truth or ImuTruth()
     rate = rig.imu_noise.update_rate
     if rate is None:
         raise CalibrationError("simulate_imu: the rig's imu_noise has no update_rate.")
     count = int(np.floor(rig.duration_s * rate)) + 1
     own_ns = np.round(np.arange(count) * 1e9 / rate).astype(np.int64)
-    times = jnp.asarray(own_ns * 1e-9)
-    R_imu_target = np.swapaxes(poses_at(rig.motion, own_ns * 1e-9)[:, :3, :3], 1, 2)
+    at = own_ns * 1e-9 + truth.timeshift_imu_imu0
+    times = jnp.asarray(at)
+    R_imu_target = np.swapaxes(poses_at(rig.motion, at)[:, :3, :3], 1, 2)
     omega, acceleration = (np.asarray(values) for values in rates(rig.motion, times))
     force = np.einsum("nij,nj->ni", R_imu_target, acceleration - rig.gravity)
+    readings = _responses(truth, omega, np.asarray(angular_accelerations(rig.motion, times)), force)
 
-    gyro_bias, gyro_noise, accel_bias, accel_noise = _imu_errors(rig, count, rate, noisy)
+    gyro_bias, gyro_noise, accel_bias, accel_noise = _imu_errors(rig, count, rate, noisy, truth.number)
     return ImuRecording(
         timestamps_ns=rig.t0_ns + own_ns,
-        gyro_rad_s=omega + gyro_bias + gyro_noise,
-        accel_m_s2=force + accel_bias + accel_noise,
+        gyro_rad_s=readings[:, :3] + gyro_bias + gyro_noise,
+        accel_m_s2=readings[:, 3:] + accel_bias + accel_noise,
         noise=rig.imu_noise,
     )
 
 
-def _imu_errors(rig: SimulatedRig, count: int, rate: float, noisy: bool) -> tuple[np.ndarray, ...]:
+def _responses(truth: ImuTruth, omega: np.ndarray, alpha: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Readings (n, 6) without biases or noise, from the motion of the rig's origin (n, 3) each."""
+    model = imu_model(truth.model)
+    parameters = jnp.asarray(model.nominal if truth.parameters is None else truth.parameters, dtype=float)
+    R, t = jnp.asarray(truth.T_imu_imu0[:3, :3]), jnp.asarray(truth.T_imu_imu0[:3, 3])
+    one = functools.partial(respond, model, parameters, R, t)
+    return np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(omega), jnp.asarray(alpha), jnp.asarray(force)))
+
+
+def _imu_errors(rig: SimulatedRig, count: int, rate: float, noisy: bool, number: int) -> tuple[np.ndarray, ...]:
     """Gyro bias, gyro noise, accelerometer bias and accelerometer noise, each (count, 3) or broadcastable to it."""
-    generator = rig.generator(_IMU)
+    generator = rig.generator(_IMU) if number == 0 else rig.generator(_IMU, number)
     errors: list[np.ndarray] = []
     noise = rig.imu_noise
     for initial, density, walk in (

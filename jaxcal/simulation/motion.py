@@ -83,3 +83,9 @@ def poses_at(motion: Motion, times_s: np.ndarray) -> np.ndarray:
 def rates(motion: Motion, times_s: Float[Array, " n"]) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
     """Angular velocity (IMU frame, rad/s) and acceleration (target frame, m/s^2) at each of `times_s` (n,)."""
     return jax.vmap(motion.angular_velocity)(times_s), jax.vmap(motion.acceleration)(times_s)
+
+
+@eqx.filter_jit
+def angular_accelerations(motion: Motion, times_s: Float[Array, " n"]) -> Float[Array, "n 3"]:
+    """Derivative of the angular velocity (IMU frame, rad/s^2) at each of `times_s` (n,)."""
+    return jax.vmap(lambda t: _derivative(motion.angular_velocity, t))(times_s)

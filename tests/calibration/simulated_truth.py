@@ -70,7 +70,8 @@ def perturbed(transform: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 
 def errors(calibration: Calibration, rig: SimulatedRig) -> dict[str, np.ndarray]:
-    """Estimate minus truth of every block of the calibration's covariance, in that block's coordinates."""
+    """Estimate minus truth of every block of the calibration's covariance, in that block's coordinates; of cameras and
+    gravity alone."""
     found: dict[str, np.ndarray] = {}
     previous: SimulatedCamera | None = None
     for camera, truth in zip(calibration.cameras, rig.cameras, strict=True):
@@ -86,7 +87,7 @@ def errors(calibration: Calibration, rig: SimulatedRig) -> dict[str, np.ndarray]
         previous = truth
     if calibration.gravity is not None:
         found["gravity"] = calibration.gravity - rig.gravity
-    return {name: found[name] for name, _ in calibration.blocks}
+    return {name: found[name] for name, _ in calibration.blocks if not name.startswith("imu")}
 
 
 def errors_in_sigmas(calibration: Calibration, rig: SimulatedRig) -> np.ndarray:
@@ -97,10 +98,11 @@ def errors_in_sigmas(calibration: Calibration, rig: SimulatedRig) -> np.ndarray:
 
 def mean_square_distance(calibration: Calibration, rig: SimulatedRig) -> float:
     """Mahalanobis distance of the truth squared, per degree of freedom: 1 on average if the covariance is right."""
-    error = np.concatenate(list(errors(calibration, rig).values()))
-    sigma = np.sqrt(np.diag(calibration.covariance))
+    found = errors(calibration, rig)
+    error, covariance = np.concatenate(list(found.values())), calibration.covariance_of(*found)
+    sigma = np.sqrt(np.diag(covariance))
     free = sigma > 0
-    values, vectors = np.linalg.eigh((calibration.covariance / np.outer(sigma, sigma))[np.ix_(free, free)])
+    values, vectors = np.linalg.eigh((covariance / np.outer(sigma, sigma))[np.ix_(free, free)])
     # Left out: relative poses of cameras repeat what T_cam_imu says, and gravity's length is known.
     known = values > 1e-8 * values.max()
     return float(np.mean((vectors.T @ (error[free] / sigma[free]))[known] ** 2 / values[known]))

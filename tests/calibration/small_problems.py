@@ -11,11 +11,15 @@ from scipy.spatial.transform import Rotation
 from jaxcal import Checkerboard, Detections, ImuNoise
 from jaxcal.calibration import solving
 from jaxcal.calibration.assemble import CameraFrames, camera_frames, vision_data
+from jaxcal.calibration.extra_imus import places_of
+from jaxcal.calibration.inertial import InertialData
+from jaxcal.calibration.lens_basis import own_parameters
 from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.spline_setup import bin_imu, make_grid
 from jaxcal.calibration.state import RigState, TargetState, flat_target, layout_of
 from jaxcal.calibration.target_shape import geometry_of
 from jaxcal.cameras import CameraModel, PinholeEquidistant, PinholeRadtan
+from jaxcal.imu import imu_model
 
 BOARD = Checkerboard(rows=3, cols=4, spacing=0.1)
 SIZE = (640, 480)
@@ -106,16 +110,22 @@ def with_unknown_target(seed: int) -> tuple[RigProblem, RigState]:
     return problem, dataclasses.replace(state, target=target)
 
 
-def with_imu(seed: int, order: int) -> tuple[RigProblem, RigState]:
-    """A spline of one second (20 knots) with IMU samples and unsynchronised frames; everything is free."""
+def with_imu(
+    seed: int, order: int, models: Sequence[str] = ("calibrated",), gravity_size: int = 2
+) -> tuple[RigProblem, RigState]:
+    """A spline of one second (20 knots) with samples of an IMU of each model and unsynchronised frames; everything is
+    free."""
     rng = np.random.default_rng(seed)
     grid = make_grid(0.0, 1.0, order, 20.0)
     cameras = random_frames(rng, 4, missing=0.2)
-    time = np.sort(rng.uniform(0.0, 1.0, 60))
-    gyro = rng.standard_normal((60, 3))
-    accel = np.array([0.0, -9.8, 0.0]) + rng.standard_normal((60, 3))
-    data, _, _ = bin_imu(grid, time, gyro, accel, ImuNoise(0.01, 0.02, 0.05, 0.1, update_rate=60.0), 60.0)
-    layout = layout_of(list(LENSES))
+    samples = []
+    for shift in 0.03 * np.arange(len(models)):
+        time = np.sort(rng.uniform(0.0, 1.0 - shift, 60))
+        gyro = rng.standard_normal((60, 3))
+        accel = np.array([0.0, -9.8, 0.0]) + rng.standard_normal((60, 3))
+        noise = ImuNoise(0.01, 0.02, 0.05, 0.1, update_rate=60.0)
+        samples.append(bin_imu(grid, time, gyro, accel, noise, 60.0, shift).samples)
+    layout = layout_of(list(LENSES), imus=places_of(models), gravity_size=gravity_size)
     count = grid.intervals + order - 1
     problem = RigProblem(
         templates=solving.templates_of(LENSES, layout),
@@ -126,9 +136,9 @@ def with_imu(seed: int, order: int) -> tuple[RigProblem, RigState]:
             times=[np.sort(rng.uniform(0.05, 0.95, len(frames.frames))) for frames in cameras],
         ),
         geometry=geometry_of(BOARD),
-        imu=data,
+        imu=InertialData(tuple(samples), jnp.asarray(grid.start), jnp.asarray(grid.dt)),
         prior=solving.lens_prior(LENSES, layout, cameras),
-        free_chain=jnp.ones((count, 12), dtype=bool),
+        free_chain=jnp.ones((count, 6 + 6 * len(models)), dtype=bool),
         free=jnp.ones(layout.size, dtype=bool),
         loss_width=jnp.asarray(jnp.inf),
         basis=own_parameters(LENSES, layout),
@@ -145,7 +155,14 @@ def with_imu(seed: int, order: int) -> tuple[RigProblem, RigState]:
         gravity=jnp.asarray([0.3, -9.7, 1.1]),
         rotations=jnp.asarray(np.diag([1.0, -1.0, -1.0]) @ turns),
         positions=jnp.asarray(np.array([0.15, 0.1, 1.0]) + 0.05 * rng.standard_normal((count, 3))),
-        biases=jnp.asarray(0.1 * rng.standard_normal((count, 6))),
+        biases=jnp.asarray(0.1 * rng.standard_normal((count, 6 * len(models)))),
         target=flat_target(layout),
+        imu_parameters=tuple(
+            jnp.asarray(np.array(imu_model(name).nominal) + 0.1 * rng.standard_normal(imu_model(name).size))
+            for name in models
+        ),
+        R_imu_rig=jnp.asarray(Rotation.random(len(models), rng).as_matrix()).at[0].set(jnp.eye(3)),
+        t_imu_rig=jnp.asarray(0.1 * rng.standard_normal((len(models), 3))).at[0].set(0.0),
+        imu_shift=jnp.asarray(0.03 * np.arange(len(models)) * 1.02),
     )
     return random_prior(rng, problem, state), state

@@ -32,10 +32,10 @@ def test_random_problems_reach_the_optimum_or_say_so(
     stress: ModuleType, monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
     """One board and one number of views, so that one program serves the problems of a model."""
-    monkeypatch.setattr(stress, "VIEW_COUNTS", (15,))
+    monkeypatch.setattr(stress, "VIEW_COUNTS", (16,))
     monkeypatch.setattr(stress, "random_board", lambda rng: Checkerboard(6, 8, rng.uniform(0.02, 0.1)))
     rows = [stress.run_one(7, number, [model]) for number in range(4)]
-    assert all(row.views == 15 and row.model == model for row in rows)
+    assert all(row.views == 16 and row.model == model for row in rows)
     assert [row for row in rows if row.outcome == "failure unnoticed"] == []
     assert sum(row.outcome == "optimum" for row in rows) >= 3
 
@@ -43,7 +43,7 @@ def test_random_problems_reach_the_optimum_or_say_so(
 def test_the_same_number_gives_the_same_problem_and_the_table_counts_it(stress: ModuleType, tmp_path: Path) -> None:
     first, second = (stress.random_problem(np.random.default_rng([3, 1]), "pinhole-none") for _ in range(2))
     np.testing.assert_array_equal(first.frames.pixels, second.frames.pixels)
-    row = stress.Row(1, "pinhole-none", 45.0, 640, 15, 48, 0.1, 0.02, "failure unnoticed", 2.0, 1.0, 0.1, 0.5, "a, b")
+    row = stress.Row(1, "pinhole-none", 45.0, 640, 15, 48, 0.1, 0.02, "failure unnoticed", 2.0, 1.0, 0.5, "a, b")
     rows = [row, dataclasses.replace(row, number=2, outcome="optimum", field_deg=185.0)]
     with (tmp_path / "results.csv").open("w", newline="") as stream:
         writer = csv.writer(stream)

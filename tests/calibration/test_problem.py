@@ -85,12 +85,19 @@ def test_equations_with_an_unknown_target_are_those_of_autodiff(seed: int) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order", [4, 6])
-def test_equations_of_cameras_and_imu_are_those_of_autodiff(order: int) -> None:
+@pytest.mark.parametrize(
+    ("order", "models", "gravity_size"),
+    [
+        (4, ["calibrated"], 2),
+        (6, ["calibrated"], 2),
+        (5, ["scale-misalignment-size-effect", "scale-misalignment", "calibrated"], 3),
+    ],
+)
+def test_equations_of_cameras_and_imus_are_those_of_autodiff(order: int, models: list[str], gravity_size: int) -> None:
     @settings(deadline=None, max_examples=3)
     @given(seed=seeds)
     def check(seed: int) -> None:
-        assert_equations_match(*with_imu(seed, order), np.random.default_rng(seed))
+        assert_equations_match(*with_imu(seed, order, models, gravity_size), np.random.default_rng(seed))
 
     check()
 
