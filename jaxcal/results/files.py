@@ -7,14 +7,15 @@ A folder holds, each written atomically:
 - `results.txt`: for people (`jaxcal.results.text`);
 - `calibration.npz`: everything, without loss; the only one that `load_calibration` reads.
 
-`calibration.npz`, version 2, holds no pickles. `meta` is the UTF-8 of a JSON object (as uint8): `format`, `version`,
+`calibration.npz`, version 3, holds no pickles. `meta` is the UTF-8 of a JSON object (as uint8): `format`, `version`,
 `cameras` (per camera `name`, `model`, `image_size`, `timeshift_cam_imu`, `corner_sigma_px`), `target` (as in Kalibr's
 `target.yaml`), `blocks`, `converged`, `warnings`, `settings`, `versions`, and `imu` (the scalars of `ImuCalibration`)
 or null. The arrays are `covariance`, `convergence`, `gravity`; for camera k `cam<k>.parameters`, `.T_cn_cnm1`,
 `.T_cam_imu`, `.residuals_px`, `.inlier` and `.detections.timestamps_ns`, `.frame`, `.point`, `.pixels`,
 `.image_size`; and `imu.<field>` for every array of `ImuCalibration`. What is None is absent. Version 2 added
 `cam<k>.T_cam_target` and `.detections.precision`, `timeshift_cam_cam0` (in `meta`), and `target_shape.T_target_board`,
-`.warp_m`, `.offsets_m`; version 1 is read as well.
+`.warp_m`, `.offsets_m`. Version 3 added further IMUs: `extra_imus` in `meta`, a list like `imu`, and their arrays
+`imu1.<field>` and so on. Versions 1 and 2 are read as well.
 """
 
 import dataclasses
@@ -32,16 +33,27 @@ from jaxcal.cameras import camera_model, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import Detections
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration, TargetShape
-from jaxcal.results.kalibr import camchain, imu_entry, to_yaml
+from jaxcal.results.kalibr import camchain, imu_entries, to_yaml
 from jaxcal.results.text import results_text
 from jaxcal.targets import target_from_yaml
 
 FILE_NAME = "calibration.npz"
 _FORMAT = "jaxcal-calibration"
-_VERSION = 2
-_READABLE = (1, 2)
+_VERSION = 3
+_READABLE = (1, 2, 3)
 _DETECTION_ARRAYS = ("timestamps_ns", "frame", "point", "pixels")
-_IMU_SCALARS = ("origin_ns", "gyro_sigma", "accel_sigma", "noise", "knot_rate_hz", "spline_order")
+_IMU_SCALARS = (
+    "origin_ns",
+    "gyro_sigma",
+    "accel_sigma",
+    "noise",
+    "knot_rate_hz",
+    "spline_order",
+    "model",
+    "parameters",
+    "timeshift_imu_imu0",
+    "noise_ratio",
+)
 
 
 def save_calibration(calibration: Calibration, folder: Path) -> None:
@@ -53,7 +65,7 @@ def save_calibration(calibration: Calibration, folder: Path) -> None:
     chain = "camchain.yaml" if calibration.imu is None else "camchain-imucam.yaml"
     write_text(folder / chain, to_yaml(camchain(calibration)))
     if calibration.imu is not None:
-        write_text(folder / "imu.yaml", to_yaml(imu_entry(calibration.imu)))
+        write_text(folder / "imu.yaml", to_yaml(imu_entries(calibration.imus)))
     write_text(folder / "results.txt", results_text(calibration))
     content = io.BytesIO()
     np.savez_compressed(content, **_arrays(calibration))  # pyright: ignore[reportArgumentType]
@@ -92,8 +104,8 @@ def _arrays(calibration: Calibration) -> dict[str, np.ndarray]:
     if calibration.target_shape is not None:
         shape = calibration.target_shape
         arrays |= {f"target_shape.{field.name}": getattr(shape, field.name) for field in dataclasses.fields(shape)}
-    if calibration.imu is not None:
-        arrays |= {f"imu.{name}": getattr(calibration.imu, name) for name in _imu_arrays()}
+    for k, imu in enumerate(calibration.imus):
+        arrays |= {f"{_imu_key(k)}.{name}": getattr(imu, name) for name in _imu_arrays()}
     text = json.dumps(_meta(calibration), default=_plain)
     present = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
     for name, value in present.items():
@@ -134,7 +146,8 @@ def _meta(calibration: Calibration) -> dict[str, Any]:
             for camera in calibration.cameras
         ],
         "target": calibration.target.to_yaml(),
-        "imu": None if imu is None else {name: _plain_mapping(getattr(imu, name)) for name in _IMU_SCALARS},
+        "imu": None if imu is None else _imu_scalars(imu),
+        "extra_imus": [_imu_scalars(extra) for extra in calibration.extra_imus],
         "blocks": [[name, size] for name, size in calibration.blocks],
         "converged": calibration.converged,
         "warnings": list(calibration.warnings),
@@ -154,8 +167,17 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
+def _imu_scalars(imu: ImuCalibration) -> dict[str, Any]:
+    return {name: _plain_mapping(getattr(imu, name)) for name in _IMU_SCALARS}
+
+
 def _plain_mapping(value: Any) -> Any:
-    return dict(value) if isinstance(value, Mapping) else value
+    return {key: np.asarray(one).tolist() for key, one in value.items()} if isinstance(value, Mapping) else value
+
+
+def _imu_key(number: int) -> str:
+    """The first name of an IMU's arrays: that of the first one is older than the others."""
+    return "imu" if number == 0 else f"imu{number}"
 
 
 def _imu_arrays() -> list[str]:
@@ -208,14 +230,14 @@ def _read_meta(file: Path, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def _decode(meta: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
-    imu = None
-    if meta["imu"] is not None:
-        imu = ImuCalibration(**meta["imu"], **{name: arrays.get(f"imu.{name}") for name in _imu_arrays()})  # pyright: ignore[reportArgumentType]
+    entries = [] if meta["imu"] is None else [meta["imu"], *meta.get("extra_imus", ())]
+    imus = [_decode_imu(entry, _imu_key(k), arrays) for k, entry in enumerate(entries)]
     return Calibration(
         cameras=tuple(_decode_camera(entry, k, arrays) for k, entry in enumerate(meta["cameras"])),
         target=target_from_yaml(meta["target"], "target"),
         gravity=arrays.get("gravity"),
-        imu=imu,
+        imu=imus[0] if imus else None,
+        extra_imus=tuple(imus[1:]),
         blocks=tuple((str(name), int(size)) for name, size in meta["blocks"]),
         covariance=arrays["covariance"],
         convergence=arrays["convergence"],
@@ -225,6 +247,14 @@ def _decode(meta: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         converged=meta["converged"],
         target_shape=_decode_shape(arrays),
     )
+
+
+def _decode_imu(entry: dict[str, Any], key: str, arrays: dict[str, np.ndarray]) -> ImuCalibration:
+    scalars = dict(entry)
+    scalars["parameters"] = {name: np.asarray(value) for name, value in scalars.get("parameters", {}).items()}
+    if scalars.get("noise_ratio") is not None:
+        scalars["noise_ratio"] = tuple(scalars["noise_ratio"])
+    return ImuCalibration(**scalars, **{name: arrays.get(f"{key}.{name}") for name in _imu_arrays()})  # pyright: ignore[reportArgumentType]
 
 
 def _decode_shape(arrays: dict[str, np.ndarray]) -> TargetShape | None:

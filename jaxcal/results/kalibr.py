@@ -3,7 +3,7 @@
 import difflib
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,6 +85,26 @@ def model_entry(model: CameraModel) -> dict[str, Any]:
         "distortion_model": _SPELT_OUT.get(distortion, distortion),
         "intrinsics": np.asarray(model.intrinsics).tolist(),
     }
+
+
+def imu_entries(imus: Sequence[ImuCalibration]) -> dict[str, Any]:
+    """The content of Kalibr's resulting `imu.yaml` for all IMUs: 'imu0' .. 'imuN', each by its model."""
+    return {f"imu{k}": _imu_content(imu, k) for k, imu in enumerate(imus)}
+
+
+def _imu_content(imu: ImuCalibration, number: int) -> dict[str, Any]:
+    entry = dict(imu_entry(imu)["imu0"])
+    found = {name: np.asarray(value).tolist() for name, value in imu.parameters.items()}
+    entry |= {"model": imu.model, "rostopic": f"/imu{number}"}
+    if imu.T_imu_imu0 is not None:
+        entry |= {"T_i_b": np.asarray(imu.T_imu_imu0).tolist(), "time_offset": float(imu.timeshift_imu_imu0 or 0.0)}
+    if found:
+        entry["accelerometers"] = {"M": found["M_accel"]}
+        entry["gyroscopes"] = {"A": found["A_gyro"], "C_gyro_i": found["C_gyro_i"], "M": found["M_gyro"]}
+    if "r_y" in found:
+        # The x axis' accelerometer defines the IMU's origin.
+        entry["accelerometers"] |= {"rx_i": [0.0, 0.0, 0.0], "ry_i": found["r_y"], "rz_i": found["r_z"]}
+    return dict(sorted(entry.items()))
 
 
 def imu_entry(imu: ImuCalibration) -> dict[str, Any]:

@@ -16,10 +16,11 @@ def results_text(calibration: Calibration) -> str:
     if calibration.imu is not None:
         sections += [_camera_to_imu(calibration, k) for k in range(len(calibration.cameras))]
         sections += _gravity(calibration)
+        sections += [text for k, imu in enumerate(calibration.imus) for text in _imu_parameters(calibration, imu, k)]
     sections += [_heading("Calibration configuration", "=")]
     sections += [_camera_configuration(camera) for camera in calibration.cameras]
     if calibration.imu is not None:
-        sections += [_imu_configuration(calibration.imu)]
+        sections += [_imu_configuration(imu, k) for k, imu in enumerate(calibration.imus)]
     sections += [_target_configuration(calibration.target)]
     if calibration.warnings:
         sections += ["\n".join([_heading("Warnings", "="), *(f"- {warning}" for warning in calibration.warnings)])]
@@ -52,14 +53,13 @@ def _residuals(calibration: Calibration) -> list[str]:
         norms = np.linalg.norm(camera.residuals_px[camera.used], axis=1)
         normalised.append(_statistics(f"Reprojection error ({camera.name}):", norms / camera.corner_sigma_px))
         plain.append(_statistics(f"Reprojection error ({camera.name}) [px]:", norms))
-    imu = calibration.imu
-    if imu is not None:
+    for k, imu in enumerate(calibration.imus):
         gyro = np.linalg.norm(imu.gyro_rad_s - imu.gyro_predicted, axis=1)
         accel = np.linalg.norm(imu.accel_m_s2 - imu.accel_predicted, axis=1)
-        normalised.append(_statistics("Gyroscope error (imu0):", gyro / imu.gyro_sigma))
-        normalised.append(_statistics("Accelerometer error (imu0):", accel / imu.accel_sigma))
-        plain.append(_statistics("Gyroscope error (imu0) [rad/s]:", gyro))
-        plain.append(_statistics("Accelerometer error (imu0) [m/s^2]:", accel))
+        normalised.append(_statistics(f"Gyroscope error (imu{k}):", gyro / imu.gyro_sigma))
+        normalised.append(_statistics(f"Accelerometer error (imu{k}):", accel / imu.accel_sigma))
+        plain.append(_statistics(f"Gyroscope error (imu{k}) [rad/s]:", gyro))
+        plain.append(_statistics(f"Accelerometer error (imu{k}) [m/s^2]:", accel))
     return ["\n".join(normalised), "\n".join(plain)]
 
 
@@ -175,12 +175,31 @@ def _camera_configuration(camera: CameraCalibration) -> str:
     )
 
 
-def _imu_configuration(imu: ImuCalibration) -> str:
+def _imu_parameters(calibration: Calibration, imu: ImuCalibration, number: int) -> list[str]:
+    """The place and clock of a further IMU, and the parameters of an IMU's model; nothing for a plain first one."""
+    lines = []
+    if imu.T_imu_imu0 is not None and imu.timeshift_imu_imu0 is not None:
+        sigma = sigma_of(calibration, f"imu{number}.T_imu_imu0")
+        clock = sigma_of(calibration, f"imu{number}.timeshift_imu_imu0")
+        lines += [
+            f"T_ib:  (imu0 to imu{number}): ",
+            _numbers(imu.T_imu_imu0),
+            f"+- {'unknown' if sigma is None else _numbers(sigma)} (rotation x y z [rad], translation x y z [m])",
+            f"time offset imu{number} to imu0: [s] (t_imu0 = t_imu + offset)",
+            f"{imu.timeshift_imu_imu0!r} +- {'unknown' if clock is None else format(clock[0], '.3g')}",
+        ]
+    for name, value in imu.parameters.items():
+        sigma = sigma_of(calibration, f"imu{number}.{name}")
+        lines += [f"{name}:", _numbers(value), f"+- {'unknown' if sigma is None else _numbers(sigma)}"]
+    return ["\n".join([_heading(f"IMU {number} (+- is 1-sigma)", "-"), *lines])] if lines else []
+
+
+def _imu_configuration(imu: ImuCalibration, number: int) -> str:
     rate = imu.noise.get("update_rate") or 1.0 / float(np.median(np.diff(imu.t_s)))
     return "\n".join(
         [
-            _heading("IMU0", "-"),
-            "  Model: calibrated",
+            _heading(f"IMU{number}", "-"),
+            f"  Model: {imu.model}",
             f"  Update rate: {rate:.6g}",
             "  Accelerometer:",
             f"    Noise density: {imu.noise['accelerometer_noise_density']}",
@@ -190,9 +209,17 @@ def _imu_configuration(imu: ImuCalibration) -> str:
             f"    Noise density: {imu.noise['gyroscope_noise_density']}",
             f"    Noise density (discrete): {imu.gyro_sigma}",
             f"    Random walk: {imu.noise['gyroscope_random_walk']}",
+            *_noise_shown(imu),
             f"  Spline: order {imu.spline_order}, {imu.knot_rate_hz:g} knots per second",
         ]
     )
+
+
+def _noise_shown(imu: ImuCalibration) -> list[str]:
+    if imu.noise_ratio is None:
+        return []
+    gyro, accel = imu.noise_ratio
+    return [f"  Noise that the residuals show, over the stated: gyroscope {gyro:.3g}, accelerometer {accel:.3g}"]
 
 
 def _target_configuration(target: Target) -> str:

@@ -125,8 +125,8 @@ def _checks(calibration: Calibration) -> Iterator[Check]:
         yield from _projection_checks(calibration, camera)
         yield from _pose_checks(calibration, camera)
         yield from _time_checks(calibration, index)
-    if calibration.imu is not None:
-        yield from _imu_checks(calibration.imu)
+    for number, imu in enumerate(calibration.imus):
+        yield from _imu_checks(imu, f"imu{number}")
     yield from _gravity_checks(calibration)
 
 
@@ -320,7 +320,7 @@ def _time_checks(calibration: Calibration, index: int) -> Iterator[Check]:
     )
 
 
-def _imu_checks(imu: ImuCalibration) -> Iterator[Check]:
+def _imu_checks(imu: ImuCalibration, subject: str) -> Iterator[Check]:
     sensors = (
         ("gyroscope", imu.gyro_rad_s - imu.gyro_predicted, imu.gyro_sigma, imu.gyro_bias, "rad/s", _GYRO_BIAS_RAD_S),
         (
@@ -335,7 +335,7 @@ def _imu_checks(imu: ImuCalibration) -> Iterator[Check]:
     for name, residuals, sigma, bias, unit, bias_limits in sensors:
         rms = float(np.sqrt(np.nanmean((residuals / sigma) ** 2)))
         yield Check(
-            "imu0",
+            subject,
             f"{name} error over noise",
             f"{rms:.2f}",
             f"under {_IMU_RMS[0]:g}",
@@ -345,7 +345,7 @@ def _imu_checks(imu: ImuCalibration) -> Iterator[Check]:
         )
         largest = float(np.nanmax(np.abs(bias)))
         yield Check(
-            "imu0",
+            subject,
             f"{name} bias",
             f"up to {largest:.3g} {unit}",
             f"under {bias_limits[0]:g} {unit}",
