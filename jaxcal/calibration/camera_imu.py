@@ -18,6 +18,7 @@ from jaxcal.calibration.lens_basis import own_parameters
 from jaxcal.calibration.outcome import calibration_from, chain_covariance_and_sentences
 from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.robust import robust_fit
+from jaxcal.calibration.rolling import row_intervals, shutters_of
 from jaxcal.calibration.spline_setup import BinnedImu, SplineGrid
 from jaxcal.calibration.state import RigState, SharedLayout, flat_target, layout_of
 from jaxcal.calibration.target_shape import geometry_of
@@ -45,6 +46,7 @@ def calibrate_camera_imu(
     *,
     imu_models: str | Sequence[str] = "calibrated",
     gravity_magnitude: bool = False,
+    rolling_shutter: bool | Sequence[bool] = False,
     cameras: Calibration | None = None,
     names: Sequence[str] | None = None,
     intrinsics: Literal["free", "prior", "held"] = "free",
@@ -62,7 +64,9 @@ def calibrate_camera_imu(
     `detections` one per camera, `models` as for `calibrate_cameras`; `imu` one recording or several: the first one's
     frame and clock are the rig's, of each further one T_imu_imu0 and a time offset are estimated. `imu_models` for all
     or one each: 'calibrated', 'scale-misalignment', 'scale-misalignment-size-effect' (`jaxcal.imu`).
-    `gravity_magnitude` estimates the strength of gravity too, rather than its direction alone. `cameras` an earlier
+    `gravity_magnitude` estimates the strength of gravity too, rather than its direction alone. `rolling_shutter`, for
+    all cameras or one each: rows are seen one after another, and the delay of a row is estimated; a frame's time is
+    that of its first row. `cameras` an earlier
     calibration of the same cameras to start from. `intrinsics`: estimate the lenses freely, under the prior of
     `cameras`, or hold them. `imu_noise`: 'given' trusts the noise densities; 'at least given' raises them where the
     residuals are larger, so that sigmas stay honest; 'estimated' takes what the residuals show, larger or smaller.
@@ -95,7 +99,13 @@ def calibrate_camera_imu(
         if ok.sum() < 3:
             raise CalibrationError(f"{name}: {ok.sum()} frames lie within the IMU recording; at least 3 are needed.")
     binned = extra_imus.bin_all(grid, imus, [place.shift_s for place in others])
-    layout = layout_of(list(lenses), imus=extra_imus.places_of(imu_names), gravity_size=3 if gravity_magnitude else 2)
+    shutters = shutters_of(rolling_shutter, len(names))
+    layout = layout_of(
+        list(lenses),
+        imus=extra_imus.places_of(imu_names),
+        gravity_size=3 if gravity_magnitude else 2,
+        rolling=shutters,
+    )
     problem = _problem(lenses, frames, target, start, binned, grid, cameras, names, intrinsics, layout)
     state = _first_state(lenses, layout, start, others, grid, first, imu_time)
 
@@ -118,6 +128,7 @@ def calibrate_camera_imu(
         "models": [model_name(lens) for lens in lenses],
         "imu_models": imu_names,
         "gravity_magnitude": gravity_magnitude,
+        "rolling_shutter": shutters,
         "intrinsics": intrinsics,
         "imu_noise": imu_noise,
         "spline_order": spline_order,
@@ -250,6 +261,7 @@ def _problem(
         basis=own_parameters(lenses, layout),
         layout=layout,
         order=grid.order,
+        row_intervals=row_intervals(layout, grid.dt),
     )
 
 
@@ -297,6 +309,7 @@ def _first_state(
         R_imu_rig=jnp.asarray(np.stack([place.R_imu_imu0 for place in others])),
         t_imu_rig=jnp.zeros((len(others), 3)),
         imu_shift=jnp.asarray([place.shift_s for place in others]),
+        line_delay=jnp.zeros(len(lenses) if layout.rolling else 0),
     )
 
 

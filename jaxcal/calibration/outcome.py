@@ -78,6 +78,7 @@ def calibration_from(
                 inlier=frames.per_corner(fit.kept[c], False),
                 corner_sigma_px=fit.sigmas[c],
                 T_cam_target=_per_timestamp(poses[c], frames, usable[c]),
+                line_delay_s=float(np.asarray(state.line_delay)[c]) if layout.is_rolling(c) else None,
                 timeshift_cam_cam0=float(np.asarray(state.shift)[c]) if with_time and not imus else None,
             )
         )

@@ -8,11 +8,13 @@ from jaxtyping import Array, Bool, Float
 from jaxcal.calibration import inertial, vision
 from jaxcal.calibration.inertial import InertialData
 from jaxcal.calibration.lens_basis import LensBasis
+from jaxcal.calibration.rolling import linearise_rolling, rolling_errors
 from jaxcal.calibration.state import RigState, SharedLayout
 from jaxcal.calibration.target_shape import TargetGeometry, points_by_target, target_points
-from jaxcal.calibration.vision import FramePoses, VisionData
+from jaxcal.calibration.vision import FrameEquations, FramePoses, VisionData
 from jaxcal.cameras import CameraModel
 from jaxcal.estimation import BlockArrow, band_from_windows, chain_from_windows, robust_loss
+from jaxcal.trajectory import PoseSpline
 
 
 class LensPrior(eqx.Module):
@@ -28,7 +30,8 @@ class RigProblem(eqx.Module):
     Without `imu` the chain holds one pose per view (band width zero); with it, spline control points and biases.
     `free_chain` (B,) and `free` (P,) say which coordinates are estimated; the others are held. `loss_width` is the
     scale of the robust loss in sigmas of a corner; infinity for plain least squares. `basis` are the directions along
-    which steps of the lenses are counted.
+    which steps of the lenses are counted. `row_intervals` is how many knot intervals the rows of a rolling-shutter
+    image may span.
     """
 
     templates: tuple[CameraModel, ...]
@@ -43,6 +46,7 @@ class RigProblem(eqx.Module):
     layout: SharedLayout = eqx.field(static=True)
     order: int = eqx.field(static=True)
     loss: str = eqx.field(static=True, default="huber")
+    row_intervals: int = eqx.field(static=True, default=1)
 
     # --- the engine's protocol ---------------------------------------------------------------------------------------
 
@@ -102,7 +106,9 @@ class RigProblem(eqx.Module):
         """Projection minus measurement of every corner, px, per group."""
         points = self.points(state)
         return tuple(
-            vision.frame_residuals(self.templates[g], state, data, self.poses(state, data), g, points)
+            rolling_errors(self.templates[g], state, data, self._spline(state), g, points)
+            if self.layout.is_rolling(self.layout.groups[g][0])
+            else vision.frame_residuals(self.templates[g], state, data, self.poses(state, data), g, points)
             for g, data in enumerate(self.corners)
         )
 
@@ -120,29 +126,30 @@ class RigProblem(eqx.Module):
         shared = jnp.zeros((self.layout.size, self.layout.size))
         gradient = jnp.zeros(self.layout.size)
         borders: dict[int, Array] = {}
+        delays: list[Array] = []
         cost = jnp.zeros(())
-        for group, data in enumerate(self.corners):
-            poses = self.poses(state, data)
-            frames = vision.linearise_frames(
-                self.templates[group], state, data, poses, group, points, by_target, self.robust, self.basis[group]
-            )
-            window = window.at[poses.start].add(frames.window)
-            gradient_window = gradient_window.at[poses.start].add(frames.gradient_window)
+        for group in range(len(self.corners)):
+            frames = self._frames(state, group, points, by_target)
+            window = window.at[frames.start].add(frames.window)
+            gradient_window = gradient_window.at[frames.start].add(frames.gradient_window)
             cost = cost + frames.cost
             members, lens = self.layout.groups[group], state.lenses[group].shape[1]
             own = frames.cross[..., : 7 + lens]
-            border = jnp.zeros((len(members), intervals, *own.shape[1:])).at[data.camera, poses.start].add(own)
+            border = jnp.zeros((len(members), intervals, *own.shape[1:])).at[frames.camera, frames.start].add(own)
             if targets:
-                border_target = border_target.at[poses.start].add(frames.cross[..., 7 + lens :])
+                border_target = border_target.at[frames.start].add(frames.cross[..., -targets:])
             for place, camera in enumerate(members):
                 borders[camera] = jnp.concatenate([border[place, ..., 7:], border[place, ..., :7]], axis=-1)
+                if self.layout.is_rolling(camera):
+                    of_camera = jnp.where((frames.camera == place)[:, None, None], frames.cross[..., 7 + lens], 0.0)
+                    delays.append(jnp.zeros((intervals, self.order, 6)).at[frames.start].add(of_camera)[..., None])
                 columns = self.columns(camera)
                 shared = shared.at[columns[:, None], columns].add(frames.shared[place])
                 gradient = gradient.at[columns].add(frames.gradient_shared[place])
 
         others = self.layout.inertial
         none = jnp.zeros((intervals, self.order, 6, others.stop - others.start))
-        columns = [*(borders[c] for c in range(self.layout.num_cameras)), none, border_target]
+        columns = [*(borders[c] for c in range(self.layout.num_cameras)), none, *delays, border_target]
         padding = [(0, 0), (0, 0), (0, self.free_chain.shape[1] - 6)]
         return BlockArrow(
             band=band_from_windows(jnp.pad(window, [*padding, (0, 0), padding[-1]])),
@@ -153,11 +160,27 @@ class RigProblem(eqx.Module):
             cost=cost,
         )
 
+    def _frames(
+        self, state: RigState, group: int, points: Float[Array, "3 N"], by_target: Float[Array, "T 3 N"]
+    ) -> FrameEquations:
+        """Equations of the frames of one group, by their kind of shutter."""
+        data, template, basis = self.corners[group], self.templates[group], self.basis[group]
+        known = (template, state, data)
+        target = (group, points, by_target, self.robust, basis)
+        if self.layout.is_rolling(self.layout.groups[group][0]):
+            return linearise_rolling(*known, self._spline(state), *target, self.row_intervals)
+        return vision.linearise_frames(*known, self.poses(state, data), *target)
+
+    def _spline(self, state: RigState) -> PoseSpline:
+        assert self.imu is not None, "a rolling shutter needs a trajectory"
+        return PoseSpline(state.rotations, state.positions, self.imu.start, self.imu.dt, self.order)
+
     def columns(self, camera: int) -> np.ndarray:
-        """Where the shared coordinates of a frame's equations stand: extrinsics, shift, lens, target."""
+        """Where the shared coordinates of a frame's equations stand: extrinsics, shift, lens, line delay, target."""
         layout = self.layout
-        ranges = (layout.pose(camera), slice(layout.shift(camera), layout.shift(camera) + 1), layout.lens(camera))
-        return np.concatenate([np.arange(s.start, s.stop) for s in (*ranges, layout.target)])
+        lens, target, shift = layout.lens(camera), layout.target, layout.shift(camera)
+        delay = [layout.line_delay(camera)] if layout.is_rolling(camera) else []
+        return np.r_[layout.pose(camera), shift, lens, np.array(delay, dtype=int), target]
 
     def _add_target_prior(self, equations: BlockArrow, state: RigState) -> BlockArrow:
         """Points are likely near where they are stated to be."""

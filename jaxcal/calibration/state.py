@@ -1,5 +1,6 @@
 """The unknowns of a rig: cameras, extrinsics, time offsets, gravity, the target, and the chain of poses and biases."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -30,12 +31,12 @@ class ImuPlace:
 class SharedLayout:
     """Where each camera's parameters stand in the tangent vector of the shared parameters.
 
-    Cameras are gathered in groups of equal model, so that one compiled projection serves a group; `groups[g]` lists
-    its cameras, `sizes[c]` the number of lens parameters of camera c. The vector holds, camera by camera, the lens
-    parameters, T_cam_rig (rotation, translation), the time shift; then, IMU by IMU, the parameters of its model and, of
-    all but the first, T_imu_rig and the time shift; then the direction of gravity (2), or all of it (3); then the
-    target: T_target_board of every board but the first (6 each), the warp (2 where it is estimated), and the offsets of
-    the points (3 each, where they are).
+    Cameras are gathered in groups of equal model and shutter, so that one compiled projection serves a group;
+    `groups[g]` lists its cameras, `sizes[c]` the number of lens parameters of camera c. The vector holds, camera by
+    camera, the lens parameters, T_cam_rig (rotation, translation), the time shift; then, IMU by IMU, the parameters of
+    its model and, of all but the first, T_imu_rig and the time shift; then the direction of gravity (2), or all of it
+    (3); then the line delays of the cameras with a rolling shutter; then the target: T_target_board of every board but
+    the first (6 each), the warp (2 where it is estimated), and the offsets of the points (3 each, where they are).
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -45,6 +46,7 @@ class SharedLayout:
     offsets: int = 0
     imus: tuple[ImuPlace, ...] = ()
     gravity_size: int = 2
+    rolling: tuple[bool, ...] = ()
 
     @property
     def num_cameras(self) -> int:
@@ -53,7 +55,7 @@ class SharedLayout:
     @property
     def size(self) -> int:
         inertial = sum(imu.size for imu in self.imus) + self.gravity_size
-        return sum(self.sizes) + 7 * self.num_cameras + inertial + self.target_size
+        return sum(self.sizes) + 7 * self.num_cameras + inertial + sum(self.rolling) + self.target_size
 
     @property
     def target_size(self) -> int:
@@ -84,12 +86,20 @@ class SharedLayout:
     @property
     def inertial(self) -> slice:
         """All IMUs, and gravity."""
-        return slice(self.start(self.num_cameras), self.size - self.target_size)
+        return slice(self.start(self.num_cameras), self.gravity.stop)
 
     @property
     def gravity(self) -> slice:
-        stop = self.size - self.target_size
+        stop = self.size - self.target_size - sum(self.rolling)
         return slice(stop - self.gravity_size, stop)
+
+    def is_rolling(self, camera: int) -> bool:
+        """Whether a camera has a rolling shutter, whose line delay is estimated."""
+        return bool(self.rolling) and self.rolling[camera]
+
+    def line_delay(self, camera: int) -> int:
+        """Where the line delay of a camera with a rolling shutter stands."""
+        return self.gravity.stop + sum(self.rolling[:camera])
 
     def gravity_basis(self, gravity: Float[Array, "3"]) -> Float[Array, "3 g"]:
         """Directions in which gravity may move: two across it, or all three."""
@@ -115,12 +125,14 @@ def layout_of(
     offsets: int = 0,
     imus: tuple[ImuPlace, ...] = (),
     gravity_size: int = 2,
+    rolling: Sequence[bool] = (),
 ) -> SharedLayout:
-    """Group cameras by their model class; `offsets` is the number of points that may move, or 0."""
-    classes = list(dict.fromkeys(type(model) for model in models))
-    groups = tuple(tuple(c for c, model in enumerate(models) if type(model) is cls) for cls in classes)
+    """Group cameras by their model class and shutter; `offsets` is the number of points that may move, or 0."""
+    kinds = list(zip(map(type, models), rolling if any(rolling) else [False] * len(models), strict=True))
+    groups = tuple(tuple(c for c, own in enumerate(kinds) if own == kind) for kind in dict.fromkeys(kinds))
     sizes = tuple(model.num_parameters for model in models)
-    return SharedLayout(groups, sizes, extra_boards, warp, offsets, imus, gravity_size)
+    shutters = tuple(rolling) if any(rolling) else ()
+    return SharedLayout(groups, sizes, extra_boards, warp, offsets, imus, gravity_size, shutters)
 
 
 class TargetState(eqx.Module):
@@ -167,7 +179,7 @@ class RigState(eqx.Module):
     (K, 3, 3) and `positions` (K, 3) of T_target_rig (poses of views, or control points), `biases` (K, 6 M) gyro then
     accel of each of the M IMUs; `target` what is not known of the target. Of each IMU its model's parameters,
     `R_imu_rig`, `t_imu_rig`, and `imu_shift` s, rig time = IMU time + shift; the first one's frame and clock are the
-    rig's.
+    rig's. `line_delay` (C,) s per row, zero for global shutters; empty where all are global.
     """
 
     lenses: tuple[Float[Array, "_ _"], ...]
@@ -183,6 +195,7 @@ class RigState(eqx.Module):
     R_imu_rig: Float[Array, "M 3 3"] = eqx.field(default_factory=lambda: jnp.zeros((0, 3, 3)))
     t_imu_rig: Float[Array, "M 3"] = eqx.field(default_factory=lambda: jnp.zeros((0, 3)))
     imu_shift: Float[Array, " M"] = eqx.field(default_factory=lambda: jnp.zeros(0))
+    line_delay: Float[Array, " D"] = eqx.field(default_factory=lambda: jnp.zeros(0))
 
     def retract(self, layout: SharedLayout, chain: Float[Array, "K B"], shared: Float[Array, " P"]) -> "RigState":
         """Move along a tangent step: rotations of the chain on the right, those of the cameras on the left."""
@@ -219,7 +232,14 @@ class RigState(eqx.Module):
             R_imu_rig=exp(moved[:, :3]) @ self.R_imu_rig,
             t_imu_rig=self.t_imu_rig + moved[:, 3:6],
             imu_shift=self.imu_shift + moved[:, 6],
+            line_delay=self.line_delay + self._delay_steps(layout, shared) if layout.rolling else self.line_delay,
         )
+
+    @staticmethod
+    def _delay_steps(layout: SharedLayout, shared: Float[Array, " P"]) -> Float[Array, " C"]:
+        cameras = range(layout.num_cameras)
+        zero = jnp.zeros(())
+        return jnp.stack([shared[layout.line_delay(c)] if layout.is_rolling(c) else zero for c in cameras])
 
 
 def tangent_basis(vector: Float[Array, "3"]) -> Float[Array, "3 2"]:

@@ -88,6 +88,7 @@ def labels_of(names: Sequence[str], models: Sequence[CameraModel], layout: Share
         own = imu_model(imu.model).labels() + ([*pose, "time shift"] if imu.placed else [])
         labels += [f"imu{number} {label}" for label in own]
     labels += [f"gravity {axis}" for axis in ("direction 1", "direction 2", "z")[: layout.gravity_size]]
+    labels += [f"{name} line delay" for c, name in enumerate(names) if layout.is_rolling(c)]
     labels += [f"board {b + 1} {label}" for b in range(layout.extra_boards) for label in pose]
     labels += ["board warp x", "board warp y"] if layout.warp else []
     return labels + [f"point {i} offset {a}" for i in range(layout.offsets) for a in "xyz"]
@@ -131,6 +132,9 @@ def named_covariance(
         if with_time and (with_imu or c > 0):
             blocks.append((f"{name}.timeshift_cam_{'imu' if with_imu else 'cam0'}", 1))
             rows.append(identity[[layout.shift(c)]])
+        if layout.is_rolling(c):
+            blocks.append((f"{name}.line_delay", 1))
+            rows.append(identity[[layout.line_delay(c)]])
     if with_imu:
         blocks.append(("gravity", 3))
         rows.append(np.asarray(layout.gravity_basis(state.gravity)) @ identity[layout.gravity])

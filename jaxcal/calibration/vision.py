@@ -7,7 +7,7 @@ from typing import Protocol
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.calibration.state import RigState
 from jaxcal.cameras import CameraModel
@@ -91,9 +91,12 @@ def spline_poses(state: RigState, data: VisionData, start: Array, dt: Array, ord
 
 
 class FrameEquations(eqx.Module):
-    """Gauss-Newton contributions of frames to a window of k chain blocks (6 coordinates each) and to q = n + 7 + T
-    shared coordinates (lens, extrinsics, time shift; target); and what the frames of each camera add up to."""
+    """Gauss-Newton contributions of frames, or parts of frames, to a window of k chain blocks (6 coordinates each) from
+    `start` on and to q shared coordinates (extrinsics, time shift, lens, line delay of a rolling shutter, target); and
+    what those of each camera of the group add up to."""
 
+    start: Int[Array, " F"]
+    camera: Int[Array, " F"]
     window: Float[Array, "F k 6 k 6"]
     cross: Float[Array, "F k 6 q"]
     gradient_window: Float[Array, "F k 6"]
@@ -177,7 +180,7 @@ def linearise_frames(
     start = (jnp.zeros((cameras, q, q)), jnp.zeros((cameras, q)), jnp.zeros(()))
     (shared, gradient_shared, cost), chain = jax.lax.scan(batch, start, (camera, R_cam_rig, batches))
     window, cross, gradient_window = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in chain)
-    return FrameEquations(window, cross, gradient_window, shared, gradient_shared, cost)
+    return FrameEquations(poses.start, data.camera, window, cross, gradient_window, shared, gradient_shared, cost)
 
 
 def equations_of_each_frame(
@@ -204,6 +207,26 @@ def equations_of_each_frame(
     lenses, R_cam_rig = state.lenses[group][data.camera], state.R_cam_rig[data.rig_camera]
     frames = (lenses, R_cam_rig, poses, rotation, translation, data.pixels, data.weight)
     return jax.lax.map(one, frames, batch_size=FRAME_BATCH)
+
+
+def pulled_back(
+    template: CameraModel,
+    lens: Float[Array, " n"],
+    along: Float[Array, "n n"] | None,
+    camera_point: Float[Array, "3"],
+    seen: Bool[Array, ""],
+) -> tuple[Float[Array, "2"], Float[Array, "2 3"], Float[Array, "2 n"]]:
+    """The pixel of one point, with its derivatives by the point and by the lens (along its basis)."""
+    # What is not seen may lie outside the lens's domain, where a projection may be anything; so it is put elsewhere.
+    camera_point = jnp.where(seen, camera_point, jnp.array(_HARMLESS))
+
+    def project(camera_point: Array, lens: Array) -> Array:
+        return template.with_parameters(lens).project(camera_point)
+
+    pixel, pull = jax.vjp(project, camera_point, lens)
+    rows = [pull(unit) for unit in (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))]
+    by_lens = jnp.stack([row[1] for row in rows])
+    return pixel, jnp.stack([row[0] for row in rows]), by_lens if along is None else by_lens @ along
 
 
 def _reduce_corners(

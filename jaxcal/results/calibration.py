@@ -53,7 +53,8 @@ class CameraCalibration:
     coordinate (of precision 1), estimated from the residuals; `reprojection_rms_px` the root mean square 2-D error of
     the inliers. `T_cam_target` (T, 4, 4) is the target's pose in the camera's frame for each of the detections'
     timestamps, NaN where it was not estimated. `timeshift_cam_cam0` (s, t_cam0 = t_cam + shift) where cameras without
-    an IMU were calibrated with a time offset each.
+    an IMU were calibrated with a time offset each. `line_delay_s` (s per row) of a rolling shutter: a frame's time is
+    that of its first row.
     """
 
     name: str
@@ -68,6 +69,7 @@ class CameraCalibration:
     corner_sigma_px: float
     T_cam_target: np.ndarray | None = None
     timeshift_cam_cam0: float | None = None
+    line_delay_s: float | None = None
 
     @property
     def used(self) -> np.ndarray:
@@ -127,8 +129,9 @@ class Calibration:
     `blocks` names the rows of `covariance` (P, P), in order, with their sizes: 'cam0.intrinsics',
     'cam0.distortion', 'cam1.T_cn_cnm1' (rotation x y z in rad, then translation x y z in m, both as a perturbation on
     the left: R = Exp(dr) R0, t = t0 + dt, in the frame of the camera), 'cam0.T_cam_imu' likewise,
-    'cam0.timeshift_cam_imu' (s), 'cam1.timeshift_cam_cam0' (s), 'gravity' (m/s^2, target frame), 'imu0.M_accel' and
-    other parameters of an IMU's model, 'imu1.T_imu_imu0' (as the other poses), 'imu1.timeshift_imu_imu0' (s),
+    'cam0.timeshift_cam_imu' (s), 'cam1.timeshift_cam_cam0' (s), 'cam0.line_delay' (s per row), 'gravity' (m/s^2, target
+    frame), 'imu0.M_accel' and other parameters of an IMU's model, 'imu1.T_imu_imu0' (as the other poses),
+    'imu1.timeshift_imu_imu0' (s),
     'target.T_target_board1' (as the other poses), 'target.warp' (m), 'target.offsets' (m, x y z of each point). Held
     parameters have zero variance.
 

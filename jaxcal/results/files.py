@@ -14,8 +14,9 @@ or null. The arrays are `covariance`, `convergence`, `gravity`; for camera k `ca
 `.T_cam_imu`, `.residuals_px`, `.inlier` and `.detections.timestamps_ns`, `.frame`, `.point`, `.pixels`,
 `.image_size`; and `imu.<field>` for every array of `ImuCalibration`. What is None is absent. Version 2 added
 `cam<k>.T_cam_target` and `.detections.precision`, `timeshift_cam_cam0` (in `meta`), and `target_shape.T_target_board`,
-`.warp_m`, `.offsets_m`. Version 3 added further IMUs: `extra_imus` in `meta`, a list like `imu`, and their arrays
-`imu1.<field>` and so on. Versions 1 and 2 are read as well.
+`.warp_m`, `.offsets_m`. Version 3 added `line_delay_s` of cameras, and
+further IMUs: `extra_imus` in `meta`, a list like `imu`, and their arrays `imu1.<field>` and so on. Versions 1
+and 2 are read as well.
 """
 
 import dataclasses
@@ -141,6 +142,7 @@ def _meta(calibration: Calibration) -> dict[str, Any]:
                 "image_size": list(camera.image_size),
                 "timeshift_cam_imu": camera.timeshift_cam_imu,
                 "timeshift_cam_cam0": camera.timeshift_cam_cam0,
+                "line_delay_s": camera.line_delay_s,
                 "corner_sigma_px": camera.corner_sigma_px,
             }
             for camera in calibration.cameras
@@ -289,4 +291,5 @@ def _decode_camera(entry: dict[str, Any], index: int, arrays: dict[str, np.ndarr
         corner_sigma_px=entry["corner_sigma_px"],
         T_cam_target=mine.get("T_cam_target"),
         timeshift_cam_cam0=entry.get("timeshift_cam_cam0"),
+        line_delay_s=entry.get("line_delay_s"),
     )

@@ -51,18 +51,22 @@ def simulate_detections(
     outlier_fraction: float = 0.0,
     outlier_px: float = 10.0,
     border_px: float = 3.0,
+    line_delay_s: float = 0.0,
 ) -> Detections:
     """Corners that a perfect detector with Gaussian noise would give for camera `index` of the rig.
 
     `noise_px` is the standard deviation of each coordinate. Corners closer than `border_px` to the image's edge, or
     not seen at all, are dropped: for a checkerboard or circle grid the whole frame, for an AprilGrid the tag. A
-    fraction `outlier_fraction` of the corners is displaced by Gaussian noise of `outlier_px` per coordinate.
+    fraction `outlier_fraction` of the corners is displaced by Gaussian noise of `outlier_px` per coordinate. With
+    `line_delay_s` the shutter rolls: row v is seen that many seconds times v after the frame's time.
     """
     camera = rig.cameras[index]
     times_ns = rig.frame_times_ns(camera)
     T = T_cam_target(rig, camera, rig.motion_time(camera, times_ns))
     projected, real = project_points(camera.model, jnp.asarray(T), jnp.asarray(rig.target.points))
     pixels, seen = np.asarray(projected), np.asarray(real)
+    if line_delay_s:
+        pixels = _rolled(rig, camera, rig.motion_time(camera, times_ns), pixels, line_delay_s)
     limit = np.array(camera.image_size) - 1.0 - border_px
     seen = seen & np.all((pixels >= border_px) & (pixels <= limit), axis=-1)
     seen = _whole_features(rig, seen)
@@ -73,6 +77,19 @@ def simulate_detections(
     outlier = noise.random(len(frame)) < outlier_fraction
     measured = measured + outlier[:, None] * outlier_px * noise.standard_normal((len(frame), 2))
     return Detections(times_ns, frame, point, measured, camera.image_size)
+
+
+def _rolled(
+    rig: SimulatedRig, camera: SimulatedCamera, time_s: np.ndarray, pixels: np.ndarray, line_delay_s: float
+) -> np.ndarray:
+    """Pixels (F, N, 2) of points each seen when its own row is: the row settles in a few rounds."""
+    frames, count = pixels.shape[:2]
+    points = np.concatenate([rig.target.points, np.ones((count, 1))], axis=1)
+    for _ in range(4):
+        rows = np.clip(np.nan_to_num(pixels[..., 1]), 0.0, camera.image_size[1] - 1.0)
+        T = T_cam_target(rig, camera, (time_s[:, None] + line_delay_s * rows).ravel()).reshape(frames, count, 4, 4)
+        pixels = np.asarray(camera.model.project(np.einsum("fnij,nj->fni", T, points)[..., :3]))
+    return pixels
 
 
 def _whole_features(rig: SimulatedRig, seen: np.ndarray) -> np.ndarray:

@@ -87,7 +87,11 @@ def errors(calibration: Calibration, rig: SimulatedRig) -> dict[str, np.ndarray]
         previous = truth
     if calibration.gravity is not None:
         found["gravity"] = calibration.gravity - rig.gravity
-    return {name: found[name] for name, _ in calibration.blocks if not name.startswith("imu")}
+    return {
+        name: found[name]
+        for name, _ in calibration.blocks
+        if not name.startswith("imu") and not name.endswith("line_delay")
+    }
 
 
 def errors_in_sigmas(calibration: Calibration, rig: SimulatedRig) -> np.ndarray:

@@ -111,7 +111,7 @@ def with_unknown_target(seed: int) -> tuple[RigProblem, RigState]:
 
 
 def with_imu(
-    seed: int, order: int, models: Sequence[str] = ("calibrated",), gravity_size: int = 2
+    seed: int, order: int, models: Sequence[str] = ("calibrated",), gravity_size: int = 2, rolling: bool = False
 ) -> tuple[RigProblem, RigState]:
     """A spline of one second (20 knots) with samples of an IMU of each model and unsynchronised frames; everything is
     free."""
@@ -125,7 +125,8 @@ def with_imu(
         accel = np.array([0.0, -9.8, 0.0]) + rng.standard_normal((60, 3))
         noise = ImuNoise(0.01, 0.02, 0.05, 0.1, update_rate=60.0)
         samples.append(bin_imu(grid, time, gyro, accel, noise, 60.0, shift).samples)
-    layout = layout_of(list(LENSES), imus=places_of(models), gravity_size=gravity_size)
+    shutters = [rolling and c == 0 for c in range(CAMERAS)]
+    layout = layout_of(list(LENSES), imus=places_of(models), gravity_size=gravity_size, rolling=shutters)
     count = grid.intervals + order - 1
     problem = RigProblem(
         templates=solving.templates_of(LENSES, layout),
@@ -144,6 +145,7 @@ def with_imu(
         basis=own_parameters(LENSES, layout),
         layout=layout,
         order=order,
+        row_intervals=3,
     )
     turns = Rotation.from_rotvec(np.cumsum(0.1 * rng.standard_normal((count, 3)), axis=0)).as_matrix()
     R_cam_rig, t_cam_rig = extrinsics(rng)
@@ -164,5 +166,6 @@ def with_imu(
         R_imu_rig=jnp.asarray(Rotation.random(len(models), rng).as_matrix()).at[0].set(jnp.eye(3)),
         t_imu_rig=jnp.asarray(0.1 * rng.standard_normal((len(models), 3))).at[0].set(0.0),
         imu_shift=jnp.asarray(0.03 * np.arange(len(models)) * 1.02),
+        line_delay=jnp.asarray([1e-4 * s for s in shutters]) if rolling else jnp.zeros(0),
     )
     return random_prior(rng, problem, state), state

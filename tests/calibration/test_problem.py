@@ -86,18 +86,20 @@ def test_equations_with_an_unknown_target_are_those_of_autodiff(seed: int) -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("order", "models", "gravity_size"),
+    ("order", "models", "gravity_size", "rolling"),
     [
-        (4, ["calibrated"], 2),
-        (6, ["calibrated"], 2),
-        (5, ["scale-misalignment-size-effect", "scale-misalignment", "calibrated"], 3),
+        (4, ["calibrated"], 2, False),
+        (6, ["calibrated"], 2, True),
+        (5, ["scale-misalignment-size-effect", "scale-misalignment", "calibrated"], 3, False),
     ],
 )
-def test_equations_of_cameras_and_imus_are_those_of_autodiff(order: int, models: list[str], gravity_size: int) -> None:
+def test_equations_of_cameras_and_imus_are_those_of_autodiff(
+    order: int, models: list[str], gravity_size: int, rolling: bool
+) -> None:
     @settings(deadline=None, max_examples=3)
     @given(seed=seeds)
     def check(seed: int) -> None:
-        assert_equations_match(*with_imu(seed, order, models, gravity_size), np.random.default_rng(seed))
+        assert_equations_match(*with_imu(seed, order, models, gravity_size, rolling), np.random.default_rng(seed))
 
     check()
 

@@ -192,7 +192,7 @@ def test_another_npz_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 3}, "version 3.*upgrade jaxcal"),
+        ({"version": 4}, "version 4.*upgrade jaxcal"),
         ({"version": 0}, "version 0.*calibrate and save again"),
         ({"version": None}, "version None"),
         ({"format": "something"}, "format is 'something'"),
