@@ -17,6 +17,7 @@ from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.restart import confirm_optimum
 from jaxcal.calibration.rig_graph import RigGraph, Sightings
 from jaxcal.calibration.robust import robust_fit
+from jaxcal.calibration.rolling import shutters_of
 from jaxcal.calibration.state import RigState, SharedLayout, layout_of
 from jaxcal.calibration.unsynchronised import continuous_problem
 from jaxcal.calibration.views import BoardFrames, associate, split_boards
@@ -37,6 +38,7 @@ def calibrate_cameras(
     names: Sequence[str] | None = None,
     sync_tolerance_s: float = 0.002,
     time_offsets: bool = False,
+    rolling_shutter: bool | Sequence[bool] = False,
     views: int | None = None,
     board_warp: bool = False,
     point_offset_sigma_m: float | None = None,
@@ -53,6 +55,8 @@ def calibrate_cameras(
 
     `time_offsets`: for cameras that are not synchronised (video of a moving rig or board): no frames need coincide; the
     rig moves on a continuous-time spline and a time offset is estimated for each camera (`timeshift_cam_cam0`).
+    `rolling_shutter`, for all cameras or one each: video of a camera whose rows are seen one after another; the delay
+    of a row is estimated on the spline as well (and the offsets with it), a frame's time is that of its first row.
     `views`: use only that many views, chosen so that they tell most (`selection`). `board_warp` estimates how the
     board is bent (two numbers); `point_offset_sigma_m` lets every point of the target move, under a prior of that
     1-sigma in metres. `loss`: the robust loss under which outliers are found; they are left out of the final least
@@ -64,6 +68,8 @@ def calibrate_cameras(
     """
     classes = resolve_models(detections, models)
     names = resolve_names(detections, names)
+    shutters = shutters_of(rolling_shutter, len(detections))
+    time_offsets = time_offsets or any(shutters)
     _check_options(target, time_offsets, views, loss)
     cameras = [camera_frames(d, target, name) for d, name in zip(detections, names, strict=True)]
     look = _first_look(names, classes, cameras, target, progress)
@@ -72,6 +78,7 @@ def calibrate_cameras(
         extra_boards=len(target.boards) - 1,
         warp=board_warp,
         offsets=len(target.points) if point_offset_sigma_m is not None else 0,
+        rolling=shutters,
     )
     shape = _Shape(layout, point_offset_sigma_m, loss)
     if time_offsets:
@@ -95,6 +102,7 @@ def calibrate_cameras(
         "models": [model_name(cls) for cls in classes],
         "sync_tolerance_s": sync_tolerance_s,
         "time_offsets": time_offsets,
+        "rolling_shutter": shutters,
         "views": views,
         "board_warp": board_warp,
         "point_offset_sigma_m": point_offset_sigma_m,

@@ -13,6 +13,7 @@ from jaxcal.calibration.initial_imu import CameraTrack
 from jaxcal.calibration.lens_basis import own_parameters
 from jaxcal.calibration.poses import Poses, inverse
 from jaxcal.calibration.problem import RigProblem
+from jaxcal.calibration.rolling import row_intervals
 from jaxcal.calibration.spline_setup import SplineGrid
 from jaxcal.calibration.state import RigState, SharedLayout, flat_target
 from jaxcal.calibration.target_shape import geometry_of
@@ -23,7 +24,9 @@ from jaxcal.targets import Target
 _ORDER = 4
 # Knots per frame of all cameras together: fewer than frames, so that they over-determine the trajectory.
 _KNOTS_PER_FRAME = 0.6
-_KNOT_RATES_HZ = (8.0, 40.0)
+# The rows of a rolling shutter see the motion between frames as well.
+_KNOTS_PER_ROLLING_FRAME = 1.5
+_KNOT_RATES_HZ = (8.0, 60.0)
 # Room beyond the first and last frame for the offsets to move (s), and how near to it frames may lie.
 _MARGIN_S = 0.1
 _EDGE_S = 0.01
@@ -74,7 +77,7 @@ def continuous_problem(
     shift, rotation = _align_with_first(names, tracks)
     arms = initial_imu.lever_arms(tracks[0], tracks, shift, 0.0)
     arms[0] = np.zeros(3)
-    grid = _grid(tracks, shift)
+    grid = _grid(tracks, shift, layout)
     times = [(frames.time_ns - origin) * 1e-9 for frames in cameras]
     usable = [(t + s > grid.start + _EDGE_S) & (t + s < grid.stop - _EDGE_S) for t, s in zip(times, shift, strict=True)]
 
@@ -96,6 +99,7 @@ def continuous_problem(
         layout=layout,
         order=_ORDER,
         loss=loss,
+        row_intervals=row_intervals(layout, grid.dt),
     )
     time, R, p = _merged(tracks, shift, rotation, arms)
     rotations, positions = spline_setup.first_chain(grid, time, R, time, p)
@@ -109,6 +113,7 @@ def continuous_problem(
         positions=jnp.asarray(positions),
         biases=jnp.zeros((knots, 0)),
         target=flat_target(layout),
+        line_delay=jnp.zeros(len(lenses) if layout.rolling else 0),
     )
     return Unsynchronised(problem, state, usable, grid)
 
@@ -130,11 +135,14 @@ def _align_with_first(names: Sequence[str], tracks: Sequence[CameraTrack]) -> tu
     return shift, rotation
 
 
-def _grid(tracks: Sequence[CameraTrack], shift: Sequence[float]) -> SplineGrid:
+def _grid(tracks: Sequence[CameraTrack], shift: Sequence[float], layout: SharedLayout) -> SplineGrid:
     first = min(t.time_s[0] + s for t, s in zip(tracks, shift, strict=True)) - _MARGIN_S
     last = max(t.time_s[-1] + s for t, s in zip(tracks, shift, strict=True)) + _MARGIN_S
-    frames = sum(len(t.time_s) for t in tracks)
-    rate = float(np.clip(_KNOTS_PER_FRAME * frames / (last - first), *_KNOT_RATES_HZ))
+    knots = sum(
+        len(t.time_s) * (_KNOTS_PER_ROLLING_FRAME if layout.is_rolling(c) else _KNOTS_PER_FRAME)
+        for c, t in enumerate(tracks)
+    )
+    rate = float(np.clip(knots / (last - first), *_KNOT_RATES_HZ))
     return spline_setup.make_grid(first, last, _ORDER, rate)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from simulated_truth import errors_in_sigmas
 
-from jaxcal import Calibration, CalibrationError, calibrate_camera_imu
+from jaxcal import Calibration, CalibrationError, calibrate_camera_imu, calibrate_cameras
 from jaxcal.simulation import SimulatedRig, paper_rig, simulate_detections, simulate_imu
 
 LINE_DELAY_S = 35e-6
@@ -39,6 +39,17 @@ def test_the_line_delay_is_recovered(calibrated: Calibration) -> None:
 @pytest.mark.slow
 def test_everything_else_is_recovered_too(rig: SimulatedRig, calibrated: Calibration) -> None:
     assert np.mean(np.abs(errors_in_sigmas(calibrated, rig)) < 3.5) >= 0.97
+
+
+@pytest.mark.slow
+def test_without_an_imu_too(rig: SimulatedRig) -> None:
+    camera = dataclasses.replace(rig.cameras[0], rate_hz=30.0)
+    rig = dataclasses.replace(rig, cameras=(camera,))
+    found = calibrate_cameras(
+        [simulate_detections(rig, 0, 0.15, line_delay_s=LINE_DELAY_S)], rig.target, rolling_shutter=True
+    ).cameras[0]
+    assert found.line_delay_s == pytest.approx(LINE_DELAY_S, abs=1.5e-6)
+    np.testing.assert_allclose(found.model.intrinsics, camera.model.intrinsics, rtol=3e-3)
 
 
 def test_as_many_shutters_as_cameras_are_asked_for(rig: SimulatedRig) -> None:
