@@ -56,6 +56,7 @@ MAX_STEPS = 300
 TOLERANCE = 1e-6
 # The share of the undisplaced corners that has to be kept.
 KEPT = 0.95
+TASKS_PER_PROCESS = 40
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +101,10 @@ def main() -> int:
     jobs = [(arguments.seed, number, arguments.models) for number in range(arguments.problems) if number not in done]
     context = multiprocessing.get_context("spawn")
     with (
-        concurrent.futures.ProcessPoolExecutor(arguments.workers, mp_context=context) as pool,
+        # Processes are renewed, or the compiled programs of all models fill the memory.
+        concurrent.futures.ProcessPoolExecutor(
+            arguments.workers, mp_context=context, max_tasks_per_child=TASKS_PER_PROCESS
+        ) as pool,
         file.open("a", newline="") as stream,
         tqdm(total=arguments.problems, initial=arguments.problems - len(jobs), unit="problem") as bar,
     ):

@@ -170,11 +170,12 @@ def _plain(value: Any) -> Any:
 
 
 def _imu_scalars(imu: ImuCalibration) -> dict[str, Any]:
-    return {name: _plain_mapping(getattr(imu, name)) for name in _IMU_SCALARS}
+    scalars = {name: _plain_mapping(getattr(imu, name)) for name in _IMU_SCALARS}
+    return scalars | {"parameters": {name: np.asarray(value).tolist() for name, value in imu.parameters.items()}}
 
 
 def _plain_mapping(value: Any) -> Any:
-    return {key: np.asarray(one).tolist() for key, one in value.items()} if isinstance(value, Mapping) else value
+    return dict(value) if isinstance(value, Mapping) else value
 
 
 def _imu_key(number: int) -> str:

@@ -120,7 +120,7 @@ def with_imu(
     cameras = random_frames(rng, 4, missing=0.2)
     samples = []
     for shift in 0.03 * np.arange(len(models)):
-        time = np.sort(rng.uniform(0.0, 1.0 - shift, 60))
+        time = (np.arange(60) + rng.random(60)) / 60.0 * (1.0 - shift)
         gyro = rng.standard_normal((60, 3))
         accel = np.array([0.0, -9.8, 0.0]) + rng.standard_normal((60, 3))
         noise = ImuNoise(0.01, 0.02, 0.05, 0.1, update_rate=60.0)

@@ -108,23 +108,14 @@ def test_the_trajectory_and_the_biases_are_those_of_the_rig(rig: SimulatedRig, c
 
 
 @pytest.mark.slow
-def test_a_cubic_spline_serves_too_when_dense_enough(
-    rig: SimulatedRig, recording: tuple[list[Detections], ImuRecording]
-) -> None:
-    detections, imu = recording
+def test_a_time_offset_of_most_of_a_second_is_found_and_a_dense_cubic_spline_serves() -> None:
+    rig = hand_held_rig(seed=4, more_shift_s=0.8)
+    detections, imu = measured(rig)
     calibration = calibrate_camera_imu(detections, imu, rig.target, spline_order=4)
+    assert calibration.cameras[0].timeshift_cam_imu == pytest.approx(0.8 - 0.0031, abs=5e-4)
     assert calibration.imu is not None
     assert calibration.imu.spline_order == 4
     assert calibration.converged
-    assert_within_sigmas(calibration, rig)
-
-
-@pytest.mark.slow
-def test_a_time_offset_of_most_of_a_second_is_found() -> None:
-    rig = hand_held_rig(seed=4, more_shift_s=0.8)
-    detections, imu = measured(rig)
-    calibration = calibrate_camera_imu(detections, imu, rig.target, knot_rate_hz=KNOT_RATE_HZ)
-    assert calibration.cameras[0].timeshift_cam_imu == pytest.approx(0.8 - 0.0031, abs=5e-4)
     assert_within_sigmas(calibration, rig)
 
 

@@ -88,9 +88,9 @@ def test_equations_with_an_unknown_target_are_those_of_autodiff(seed: int) -> No
 @pytest.mark.parametrize(
     ("order", "models", "gravity_size", "rolling"),
     [
-        (4, ["calibrated"], 2, False),
+        (5, ["calibrated"], 2, False),
         (6, ["calibrated"], 2, True),
-        (5, ["scale-misalignment-size-effect", "scale-misalignment", "calibrated"], 3, False),
+        (4, ["scale-misalignment", "scale-misalignment-size-effect"], 3, False),
     ],
 )
 def test_equations_of_cameras_and_imus_are_those_of_autodiff(

@@ -20,6 +20,7 @@ from jaxcal.atomic import write_text
 from jaxcal.cameras import CameraModel, PinholeRadtan, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.results import Calibration, load_calibration, load_camchain, save_calibration
+from jaxcal.results.calibration import ImuCalibration
 from jaxcal.targets import Checkerboard
 
 
@@ -54,6 +55,10 @@ def assert_same(first: Any, second: Any, where: str = "calibration") -> None:
         assert type(first) is type(second), where
         for field in dataclasses.fields(first):
             assert_same(getattr(first, field.name), getattr(second, field.name), f"{where}.{field.name}")
+    elif where.endswith(".parameters"):
+        assert list(first) == list(second), where
+        for name in first:
+            assert_same(first[name], second[name], f"{where}[{name}]")
     elif isinstance(first, tuple | list):
         assert len(first) == len(second), where
         for index, (a, b) in enumerate(zip(first, second, strict=True)):
@@ -62,6 +67,20 @@ def assert_same(first: Any, second: Any, where: str = "calibration") -> None:
         assert np.isnan(second), where
     else:
         assert first == second, where
+
+
+def further_imu(imu: ImuCalibration, seed: int) -> ImuCalibration:
+    """A second IMU, of a model with parameters."""
+    rng = np.random.default_rng(seed)
+    return dataclasses.replace(
+        imu,
+        model="scale-misalignment",
+        parameters={"M_accel": rng.random((3, 3)), "M_gyro": rng.random((3, 3)), "A_gyro": rng.random((3, 3))}
+        | {"C_gyro_i": np.eye(3)},
+        T_imu_imu0=np.eye(4),
+        timeshift_imu_imu0=0.003,
+        noise_ratio=(1.1, 2.5),
+    )
 
 
 json_values = st.recursive(
@@ -99,6 +118,8 @@ def test_a_saved_calibration_comes_back_bit_by_bit(
     made = dataclasses.replace(made, warnings=tuple(warnings), settings=options, converged=bool(seed % 2))
     if made.imu is not None and not bias_std:
         made = dataclasses.replace(made, imu=dataclasses.replace(made.imu, gyro_bias_std=None, accel_bias_std=None))
+    if made.imu is not None and seed % 3:
+        made = dataclasses.replace(made, extra_imus=(further_imu(made.imu, seed),))
     folder = tmp_path_factory.mktemp("saved")
     made.save(folder)
     assert_same(load_calibration(folder), made)
