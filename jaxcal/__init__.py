@@ -38,6 +38,9 @@ _EXPORTS = {
     "calibrate_camera_imu": "jaxcal.calibration",
     "Calibration": "jaxcal.results",
     "load_calibration": "jaxcal.results",
+    "compare": "jaxcal.results.compare",
+    "read_calibration": "jaxcal.results.interchange",
+    "write_calibration": "jaxcal.results.interchange",
     "run_pipeline": "jaxcal.pipeline",
 }
 
@@ -52,6 +55,8 @@ if TYPE_CHECKING:
     from jaxcal.pipeline import run_pipeline
     from jaxcal.recording import load_imu, load_rig
     from jaxcal.results import Calibration, load_calibration
+    from jaxcal.results.compare import compare
+    from jaxcal.results.interchange import read_calibration, write_calibration
     from jaxcal.targets import AprilGrid, BoardSet, Charuco, Checkerboard, CircleGrid, Target, load_target
 
 

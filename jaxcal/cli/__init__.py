@@ -25,6 +25,10 @@ Record it from many sides, near and far, up to the image's corners; then calibra
     jaxcal calibrate-cameras left/ right/ --target board.yaml --models pinhole-radtan --out result
 
 \b
+Learn an IMU's noise from a recording of it lying still:
+    jaxcal imu-noise still.csv --out imu.yaml --plot allan.png
+
+\b
 See what an event recording or a bag holds, and bring it into another format:
     jaxcal info recording.raw
     jaxcal convert events recording.raw events.h5

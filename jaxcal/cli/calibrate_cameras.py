@@ -40,6 +40,9 @@ class _Size(click.ParamType):
 @click.option(
     "--time-offsets", is_flag=True, help="Cameras are not synchronised: estimate a time offset each (moving pictures)."
 )
+@click.option(
+    "--rolling-shutter", is_flag=True, help="Rows are seen one after another: estimate the delay (moving pictures)."
+)
 @click.option("--loss", default="huber", show_default=True, help="Robust loss under which outliers are found.")
 @click.option("--resolution", type=_Size(), help="Image size of corner tables that do not hold it.")
 @click.option(
@@ -55,6 +58,7 @@ def calibrate_cameras(
     board_warp: bool,
     point_offsets: float | None,
     time_offsets: bool,
+    rolling_shutter: bool,
     loss: str,
     resolution: tuple[int, int] | None,
     sync_tolerance: float,
@@ -105,6 +109,7 @@ def calibrate_cameras(
             board_warp=board_warp,
             point_offset_sigma_m=None if point_offsets is None else 1e-3 * point_offsets,
             time_offsets=time_offsets,
+            rolling_shutter=rolling_shutter,
             loss=cast("Loss", loss),
             progress=bars,
         )

@@ -80,6 +80,19 @@ def test_equations_of_cameras_alone_are_those_of_autodiff(seed: int) -> None:
 
 @settings(deadline=None, max_examples=8)
 @given(seed=seeds)
+def test_equations_along_any_directions_of_the_lenses_are_those_of_autodiff(seed: int) -> None:
+    problem, state = camera_only(seed)
+    rng = np.random.default_rng(seed)
+    basis = tuple(
+        jnp.asarray(np.eye(lens.shape[1]) + 0.3 * rng.standard_normal((*lens.shape, lens.shape[1])))
+        for lens in state.lenses
+    )
+    problem = eqx.tree_at(lambda p: p.basis, problem, basis, is_leaf=lambda leaf: leaf is None)
+    assert_equations_match(problem, state, rng)
+
+
+@settings(deadline=None, max_examples=8)
+@given(seed=seeds)
 def test_equations_with_an_unknown_target_are_those_of_autodiff(seed: int) -> None:
     assert_equations_match(*with_unknown_target(seed), np.random.default_rng(seed))
 
