@@ -23,8 +23,8 @@ logger = logging.getLogger(__name__)
 _RESTART_SIGMAS = 10.0
 _MORE_SIGMAS = (3.0, 1.0, 10.0)
 _MOST_RESTARTS = 13
-# So many restarts have to come back: in all, and on bent ground.
-_ENOUGH, _ENOUGH_BENT = 2, 4
+# So many restarts have to come back: the first, and more on bent ground.
+_ENOUGH, _ENOUGH_BENT = 1, 4
 # Costs that differ by less than this share are one optimum.
 _SAME_COST = 1e-8
 # So far may the cost at the restart exceed what the quadratic model promises; beyond, the start is nonsense (a lens
@@ -36,7 +36,7 @@ _HALVINGS = 6
 def confirm_optimum(fit: RobustFit, cameras: Sequence[CameraFrames], *, max_steps: int) -> tuple[RobustFit, list[str]]:
     """Solve again from ten sigmas away; a lower optimum found on the way is taken, and tried in turn.
 
-    Where the first restarts come back, that is all. Where not, or where the cost is far from quadratic between, more
+    Where the first restart comes back, that is all. Where not, or where the cost is far from quadratic between, more
     follow, near and far. Returns the fit to use, and a sentence where restarts do not agree. Deterministic.
     """
     rng = np.random.default_rng(0)

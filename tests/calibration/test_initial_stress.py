@@ -27,7 +27,7 @@ def stress() -> ModuleType:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["pinhole-rational8", "eucm-none"])
+@pytest.mark.parametrize("model", ["pinhole-rational8"])
 def test_random_problems_reach_the_optimum_or_say_so(
     stress: ModuleType, monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:

@@ -101,7 +101,6 @@ def test_equations_with_an_unknown_target_are_those_of_autodiff(seed: int) -> No
 @pytest.mark.parametrize(
     ("order", "models", "gravity_size", "rolling"),
     [
-        (5, ["calibrated"], 2, False),
         (6, ["calibrated"], 2, True),
         (4, ["scale-misalignment", "scale-misalignment-size-effect"], 3, False),
     ],

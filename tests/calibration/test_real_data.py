@@ -103,14 +103,14 @@ def test_a_splined_lens_is_better_than_a_rational_one_on_views_held_back(data_fo
     _, held_back = fisheye_24mp(data_folder, slice(1, None, 2))
     assert held_back.precision is not None
     scores = {}
-    for model in ("pinhole-rational8", "splined-3-16-11-150"):
+    for model in ("pinhole-rational8", "splined-3-12-9-150"):
         calibration = calibrate_cameras([made_from], board, [model], board_warp=True)
         (residuals,) = held_back_residuals(calibration, [held_back])
         # Few corners are wrong, and those by much: the median tells which lens is nearer.
         error = np.linalg.norm(residuals * held_back.precision[:, None], axis=1)
         scores[model] = float(np.median(error))
         log.info("%s: held back %.3f px (median), %.3f px (trimmed rms)", model, scores[model], _trimmed(error))
-    assert scores["splined-3-16-11-150"] < scores["pinhole-rational8"]
+    assert scores["splined-3-12-9-150"] < scores["pinhole-rational8"]
 
 
 def _trimmed(error: np.ndarray) -> float:
