@@ -10,6 +10,7 @@ from jaxcal.calibration.assemble import CameraFrames, split_groups
 from jaxcal.calibration.checks import versions
 from jaxcal.calibration.lens_basis import to_parameters
 from jaxcal.calibration.robust import RobustFit, camera_poses
+from jaxcal.calibration.rolling import check_readout
 from jaxcal.calibration.state import RigState, SharedLayout, camera_model_of, transform
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
@@ -64,6 +65,8 @@ def calibration_from(
     seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]
     results = []
     for c, (name, frames) in enumerate(zip(names, cameras, strict=True)):
+        if layout.is_rolling(c):
+            check_readout(name, float(np.asarray(state.line_delay)[c]), frames.detections.image_size[1])
         errors = np.where(seen[c][..., None], fit.errors[c], np.nan)
         results.append(
             CameraCalibration(

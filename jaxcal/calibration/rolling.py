@@ -39,6 +39,17 @@ def row_intervals(layout: SharedLayout, dt: float) -> int:
     return int(np.ceil(_LONGEST_READOUT_S / dt)) + 1 if layout.rolling else 1
 
 
+def check_readout(name: str, line_delay_s: float, rows: int) -> None:
+    """Raise CalibrationError where an image takes longer to be read out than `row_intervals` has room for: the corners
+    of its last rows were left out of the equations."""
+    if abs(line_delay_s) * rows > _LONGEST_READOUT_S:
+        raise CalibrationError(
+            f"{name}: the line delay comes out as {1e6 * line_delay_s:.1f} us, so that {rows} rows take "
+            f"{1e3 * abs(line_delay_s) * rows:.0f} ms; there is room for {1e3 * _LONGEST_READOUT_S:.0f} ms. "
+            "Is the shutter a rolling one, and is the frame's time that of its first row?"
+        )
+
+
 class _CornerPose(eqx.Module):
     """T_cam_target of one corner with Jacobians (perturbed on the left, 6 rows: rotation, translation) by the window of
     k chain blocks, the extrinsics and the time shift."""

@@ -7,6 +7,7 @@ import pytest
 from simulated_truth import errors_in_sigmas
 
 from jaxcal import Calibration, CalibrationError, calibrate_camera_imu, calibrate_cameras
+from jaxcal.calibration.rolling import check_readout
 from jaxcal.simulation import SimulatedRig, paper_rig, simulate_detections, simulate_imu
 
 LINE_DELAY_S = 35e-6
@@ -56,3 +57,9 @@ def test_as_many_shutters_as_cameras_are_asked_for(rig: SimulatedRig) -> None:
     detections = simulate_detections(rig, 0)
     with pytest.raises(CalibrationError, match="`rolling_shutter` has 2 entries for 1 cameras"):
         calibrate_camera_imu([detections], simulate_imu(rig), rig.target, rolling_shutter=[True, False])
+
+
+def test_a_readout_longer_than_there_is_room_for_is_refused() -> None:
+    check_readout("cam0", -30e-6, 480)
+    with pytest.raises(CalibrationError, match=r"cam0: the line delay comes out as 100.0 us.*take 48 ms"):
+        check_readout("cam0", 100e-6, 480)
