@@ -2,6 +2,7 @@
 
 from jaxcal.calibration.camera_imu import calibrate_camera_imu
 from jaxcal.calibration.cameras import calibrate_cameras
+from jaxcal.calibration.resolve import resolve
 from jaxcal.calibration.validation import held_back_residuals
 
-__all__ = ["calibrate_camera_imu", "calibrate_cameras", "held_back_residuals"]
+__all__ = ["calibrate_camera_imu", "calibrate_cameras", "held_back_residuals", "resolve"]

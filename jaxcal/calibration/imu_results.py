@@ -93,6 +93,7 @@ def _one(
         T_imu_imu0=_placed(state, number) if place.placed else None,
         timeshift_imu_imu0=float(state.imu_shift[number]) if place.placed else None,
         noise_ratio=(ratio[0], ratio[1]),
+        recording=imu,
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
-from jaxcal.observations import Detections
+from jaxcal.observations import Detections, ImuRecording
 from jaxcal.targets import Target
 
 
@@ -96,6 +96,8 @@ class ImuCalibration:
     `model` is Kalibr's name of the IMU model and `parameters` its matrices by Kalibr's names. Of further IMUs also
     `T_imu_imu0` (4, 4), mapping points from the first one's frame, and `timeshift_imu_imu0` (s, t_imu0 = t_imu +
     shift). `noise_ratio` is the noise that the residuals show over the stated one (gyro, accel), whether or not used.
+    `recording` is all that was given, samples that were not used included: what `jaxcal.resolve` starts from (None in
+    results of earlier releases).
     """
 
     origin_ns: int
@@ -120,6 +122,7 @@ class ImuCalibration:
     T_imu_imu0: np.ndarray | None = None
     timeshift_imu_imu0: float | None = None
     noise_ratio: tuple[float, float] | None = None
+    recording: ImuRecording | None = None
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ A folder holds, each written atomically:
 - `results.txt`: for people (`jaxcal.results.text`);
 - `calibration.npz`: everything, without loss; the only one that `load_calibration` reads.
 
-`calibration.npz`, version 3, holds no pickles. `meta` is the UTF-8 of a JSON object (as uint8): `format`, `version`,
+`calibration.npz`, version 4, holds no pickles. `meta` is the UTF-8 of a JSON object (as uint8): `format`, `version`,
 `cameras` (per camera `name`, `model`, `image_size`, `timeshift_cam_imu`, `corner_sigma_px`), `target` (as in Kalibr's
 `target.yaml`), `blocks`, `converged`, `warnings`, `settings`, `versions`, and `imu` (the scalars of `ImuCalibration`)
 or null. The arrays are `covariance`, `convergence`, `gravity`; for camera k `cam<k>.parameters`, `.T_cn_cnm1`,
@@ -15,8 +15,9 @@ or null. The arrays are `covariance`, `convergence`, `gravity`; for camera k `ca
 `.image_size`; and `imu.<field>` for every array of `ImuCalibration`. What is None is absent. Version 2 added
 `cam<k>.T_cam_target` and `.detections.precision`, `timeshift_cam_cam0` (in `meta`), and `target_shape.T_target_board`,
 `.warp_m`, `.offsets_m`. Version 3 added `line_delay_s` of cameras, and
-further IMUs: `extra_imus` in `meta`, a list like `imu`, and their arrays `imu1.<field>` and so on. Versions 1
-and 2 are read as well.
+further IMUs: `extra_imus` in `meta`, a list like `imu`, and their arrays `imu1.<field>` and so on. Version 4 added the
+whole recording of each IMU, `imu.recording.timestamps_ns`, `.gyro_rad_s`, `.accel_m_s2`, so that a calibration can be
+repeated from its file alone (`jaxcal.resolve`). Versions 1 to 3 are read as well.
 """
 
 import dataclasses
@@ -32,7 +33,7 @@ import numpy as np
 from jaxcal.atomic import write_bytes, write_text
 from jaxcal.cameras import camera_model, model_name
 from jaxcal.errors import CalibrationError
-from jaxcal.observations import Detections
+from jaxcal.observations import Detections, ImuNoise, ImuRecording
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration, TargetShape
 from jaxcal.results.kalibr import camchain, imu_entries, to_yaml
 from jaxcal.results.text import results_text
@@ -40,9 +41,10 @@ from jaxcal.targets import target_from_yaml
 
 FILE_NAME = "calibration.npz"
 _FORMAT = "jaxcal-calibration"
-_VERSION = 3
-_READABLE = (1, 2, 3)
+_VERSION = 4
+_READABLE = (1, 2, 3, 4)
 _DETECTION_ARRAYS = ("timestamps_ns", "frame", "point", "pixels")
+_RECORDING_ARRAYS = ("timestamps_ns", "gyro_rad_s", "accel_m_s2")
 _IMU_SCALARS = (
     "origin_ns",
     "gyro_sigma",
@@ -107,6 +109,9 @@ def _arrays(calibration: Calibration) -> dict[str, np.ndarray]:
         arrays |= {f"target_shape.{field.name}": getattr(shape, field.name) for field in dataclasses.fields(shape)}
     for k, imu in enumerate(calibration.imus):
         arrays |= {f"{_imu_key(k)}.{name}": getattr(imu, name) for name in _imu_arrays()}
+        if imu.recording is not None:
+            of_recording = {name: getattr(imu.recording, name) for name in _RECORDING_ARRAYS}
+            arrays |= {f"{_imu_key(k)}.recording.{name}": value for name, value in of_recording.items()}
     text = json.dumps(_meta(calibration), default=_plain)
     present = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
     for name, value in present.items():
@@ -184,7 +189,8 @@ def _imu_key(number: int) -> str:
 
 
 def _imu_arrays() -> list[str]:
-    return [field.name for field in dataclasses.fields(ImuCalibration) if field.name not in _IMU_SCALARS]
+    left = (*_IMU_SCALARS, "recording")
+    return [field.name for field in dataclasses.fields(ImuCalibration) if field.name not in left]
 
 
 # --- reading ---------------------------------------------------------------------------------------------------------
@@ -257,7 +263,16 @@ def _decode_imu(entry: dict[str, Any], key: str, arrays: dict[str, np.ndarray]) 
     scalars["parameters"] = {name: np.asarray(value) for name, value in scalars.get("parameters", {}).items()}
     if scalars.get("noise_ratio") is not None:
         scalars["noise_ratio"] = tuple(scalars["noise_ratio"])
+    scalars["recording"] = _decode_recording(entry, key, arrays)
     return ImuCalibration(**scalars, **{name: arrays.get(f"{key}.{name}") for name in _imu_arrays()})  # pyright: ignore[reportArgumentType]
+
+
+def _decode_recording(entry: dict[str, Any], key: str, arrays: dict[str, np.ndarray]) -> ImuRecording | None:
+    if f"{key}.recording.timestamps_ns" not in arrays:
+        return None
+    return ImuRecording(
+        **{name: arrays[f"{key}.recording.{name}"] for name in _RECORDING_ARRAYS}, noise=ImuNoise(**entry["noise"])
+    )
 
 
 def _decode_shape(arrays: dict[str, np.ndarray]) -> TargetShape | None:

@@ -19,6 +19,7 @@ import jaxcal
 from jaxcal.atomic import write_text
 from jaxcal.cameras import CameraModel, PinholeRadtan, model_name
 from jaxcal.errors import CalibrationError
+from jaxcal.observations import ImuNoise, ImuRecording
 from jaxcal.results import Calibration, load_calibration, load_camchain, save_calibration
 from jaxcal.results.calibration import ImuCalibration
 from jaxcal.targets import Checkerboard
@@ -67,6 +68,12 @@ def assert_same(first: Any, second: Any, where: str = "calibration") -> None:
         assert np.isnan(second), where
     else:
         assert first == second, where
+
+
+def recorded(imu: ImuCalibration) -> ImuRecording:
+    """A whole recording from which an IMU's result may have been made."""
+    times = imu.origin_ns + np.round(imu.t_s * 1e9).astype(np.int64)
+    return ImuRecording(times, imu.gyro_rad_s, imu.accel_m_s2, ImuNoise(**imu.noise))
 
 
 def further_imu(imu: ImuCalibration, seed: int) -> ImuCalibration:
@@ -118,6 +125,8 @@ def test_a_saved_calibration_comes_back_bit_by_bit(
     made = dataclasses.replace(made, warnings=tuple(warnings), settings=options, converged=bool(seed % 2))
     if made.imu is not None and not bias_std:
         made = dataclasses.replace(made, imu=dataclasses.replace(made.imu, gyro_bias_std=None, accel_bias_std=None))
+    if made.imu is not None and seed % 5:
+        made = dataclasses.replace(made, imu=dataclasses.replace(made.imu, recording=recorded(made.imu)))
     if made.imu is not None and seed % 3:
         made = dataclasses.replace(made, extra_imus=(further_imu(made.imu, seed),))
     folder = tmp_path_factory.mktemp("saved")
@@ -213,7 +222,7 @@ def test_another_npz_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 4}, "version 4.*upgrade jaxcal"),
+        ({"version": 5}, "version 5.*upgrade jaxcal"),
         ({"version": 0}, "version 0.*calibrate and save again"),
         ({"version": None}, "version None"),
         ({"format": "something"}, "format is 'something'"),
