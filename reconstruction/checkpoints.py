@@ -2,9 +2,7 @@
 
 import json
 import os
-import pickle
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ from safetensors.torch import save_file
 
 from jaxcal.errors import CalibrationError
 from reconstruction.networks import ARCHITECTURES, ReconstructionNetwork
+from reconstruction.official import read_official
 
 DEFAULT_NETWORK = "patterns_v1"
 
@@ -28,8 +27,8 @@ def load_network(path_or_name: str | os.PathLike[str] | None = None) -> Reconstr
     """A network ready for inference (eval mode, float32, CPU).
 
     `path_or_name`: None for the network that jaxcal ships; the name of a file in `models/` (without suffix); or a
-    path to one of ours (`.safetensors`) or to a checkpoint in the official E2VID format (`.pth.tar`, `.pth`, `.pt`:
-    a dict with `arch`, `model` and `state_dict`). Nothing in the file is executed.
+    path to one of ours (`.safetensors`) or to a checkpoint of E2VID, FireNet, E2VID+ or FireNet+ as their authors
+    write them (`.pth.tar`, `.pth`, `.pt`; see `reconstruction.official`). Nothing in the file is executed.
 
     Raises CalibrationError when the file is missing, truncated, of another kind, or needs code to be loaded.
     """
@@ -37,7 +36,7 @@ def load_network(path_or_name: str | os.PathLike[str] | None = None) -> Reconstr
     if path.suffix == ".safetensors":
         architecture, settings, tensors = _read_safetensors(path)
     else:
-        architecture, settings, tensors = _read_official(path)
+        architecture, settings, tensors = read_official(path)
     return _build(path, architecture, settings, tensors)
 
 
@@ -108,32 +107,6 @@ def _read_safetensors(path: Path) -> tuple[str, dict[str, Any], dict[str, torch.
     except (KeyError, json.JSONDecodeError) as error:
         raise CalibrationError(f"{path}: the network's settings in its metadata are unreadable ({error}).") from error
     return metadata.get("arch", ""), settings, tensors
-
-
-def _read_official(path: Path) -> tuple[str, dict[str, Any], dict[str, torch.Tensor]]:
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        raise CalibrationError(
-            f"{path}: refused, because it holds Python objects other than tensors and plain values, and loading those "
-            f"could execute code ({str(error).splitlines()[0]}). If you trust its origin, load it yourself and save a "
-            "dict with only the keys arch, model and state_dict."
-        ) from error
-    except Exception as error:
-        raise CalibrationError(
-            f"{path}: not a torch checkpoint, or truncated ({error}). Expected a file in the official E2VID format or "
-            "one of our .safetensors; copy or download it again."
-        ) from error
-    if not isinstance(checkpoint, Mapping) or "arch" not in checkpoint or "state_dict" not in checkpoint:
-        raise CalibrationError(
-            f"{path}: a torch file, but not an E2VID checkpoint: expected a dict with the keys arch, model, state_dict."
-        )
-    config = checkpoint.get("config")
-    # As the reference: files written during training keep the settings under "config".
-    settings = checkpoint.get("model", config.get("model") if isinstance(config, Mapping) else None)
-    if not isinstance(settings, Mapping):
-        raise CalibrationError(f"{path}: no network settings under the key 'model' (found {type(settings).__name__}).")
-    return str(checkpoint["arch"]), dict(settings), dict(checkpoint["state_dict"])
 
 
 def _build(

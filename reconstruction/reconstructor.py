@@ -126,11 +126,12 @@ class Reconstructor:
             grid = grid * self._working_cells
         if self.flip:
             grid = grid[:, ::-1, ::-1]
-        grid = np.ascontiguousarray(grid) if self.no_normalize else normalise(grid)
+        raw = self.no_normalize or not self.network.normalises
+        grid = np.ascontiguousarray(grid) if raw else normalise(grid)
         return torch.from_numpy(grid).to(self.device)
 
     def _predict(self, voxels: torch.Tensor) -> Float[torch.Tensor, "1 1 padded_height padded_width"]:
-        padded = _pad(voxels[None], self.padding)
+        padded = _pad(voxels[None], self.padding, self.network.padding)
         if self._autocast:
             padded = padded.contiguous(memory_format=torch.channels_last)
         precision: AbstractContextManager = (
@@ -191,10 +192,12 @@ def _padding(width: int, height: int, multiple: int) -> tuple[int, int, int, int
     return columns - columns // 2, columns // 2, rows - rows // 2, rows // 2
 
 
-def _pad(voxels: torch.Tensor, padding: tuple[int, int, int, int]) -> torch.Tensor:
-    """Reflected at the border as in the reference; a sensor narrower than the padding repeats its border instead."""
+def _pad(voxels: torch.Tensor, padding: tuple[int, int, int, int], kind: str) -> torch.Tensor:
+    """Padded with zeros, or reflected at the border; a sensor narrower than the padding repeats its border instead."""
     if not any(padding):
         return voxels
+    if kind == "zeros":
+        return F.pad(voxels, padding)
     height, width = voxels.shape[-2:]
     reflects = max(padding[:2]) < width and max(padding[2:]) < height
     return F.pad(voxels, padding, mode="reflect" if reflects else "replicate")

@@ -15,13 +15,16 @@ class ReconstructionNetwork(nn.Module, abc.ABC):
 
     `num_bins` time bins of the voxel grid it reads; `multiple`: input height and width must be divisible by it;
     `settings`: the numbers and names it was built from, as they stand in a checkpoint; `reduced_precision`: whether
-    it was trained to work in bfloat16.
+    it was trained to work in bfloat16; `normalises`: whether it was trained on normalised voxel grids; `padding`: what
+    surrounds an input that is too small, 'reflect' or 'zeros'.
     """
 
     num_bins: int
     multiple: int
     settings: dict[str, Any]
     reduced_precision: bool = False
+    normalises: bool = True
+    padding: str = "reflect"
 
     @abc.abstractmethod
     def forward(self, voxels: torch.Tensor, state: State | None) -> tuple[torch.Tensor, State]:

@@ -136,11 +136,12 @@ class RecurrentConvLayer(nn.Module):
         *,
         stride: int = 1,
         recurrent_block_type: str = "convlstm",
+        recurrent_kernel_size: int = 3,
         norm: str | None = None,
     ):
         super().__init__()
         self.conv = ConvLayer(in_channels, out_channels, kernel_size, stride=stride, norm=norm)
-        self.recurrent_block = RECURRENT_BLOCKS[recurrent_block_type](out_channels)
+        self.recurrent_block = RECURRENT_BLOCKS[recurrent_block_type](out_channels, recurrent_kernel_size)
 
     def forward(self, x: torch.Tensor, state: Any) -> tuple[torch.Tensor, Any]:
         return self.recurrent_block(self.conv(x), state)
@@ -149,13 +150,25 @@ class RecurrentConvLayer(nn.Module):
 class RecurrentResidualLayer(nn.Module):
     """A residual block followed by a recurrent cell."""
 
-    def __init__(self, channels: int, *, recurrent_block_type: str = "convgru", norm: str | None = None):
+    def __init__(
+        self,
+        channels: int,
+        *,
+        recurrent_block_type: str = "convgru",
+        recurrent_kernel_size: int = 3,
+        norm: str | None = None,
+    ):
         super().__init__()
         self.conv = ResidualBlock(channels, norm=norm)
-        self.recurrent_block = RECURRENT_BLOCKS[recurrent_block_type](channels)
+        self.recurrent_block = RECURRENT_BLOCKS[recurrent_block_type](channels, recurrent_kernel_size)
 
     def forward(self, x: torch.Tensor, state: Any) -> tuple[torch.Tensor, Any]:
         return self.recurrent_block(self.conv(x), state)
+
+
+def norm_name(value: Any) -> str | None:
+    """'BN', 'IN' or None: the reference turns a missing norm into the text 'None', and some files hold 'none'."""
+    return one_of("norm", None if str(value).lower() == "none" else value, ("BN", "IN", None))
 
 
 def one_of(settings_name: str, value: Any, allowed: tuple[Any, ...]) -> Any:

@@ -66,7 +66,7 @@ def test_official_defaults_have_the_published_sizes():
     assert firenet == pytest.approx(38e3, rel=0.03)
 
 
-@pytest.mark.parametrize("switch", [{"skip_type": "none"}, {"norm": "LN"}, {"recurrent_block_type": "rnn"}])
+@pytest.mark.parametrize("switch", [{"skip_type": "leap"}, {"norm": "LN"}, {"recurrent_block_type": "rnn"}])
 def test_unknown_switch_is_refused(switch: dict[str, str]):
     with pytest.raises(CalibrationError, match=f"{next(iter(switch))} is '{next(iter(switch.values()))}'"):
         E2VIDRecurrent(**switch)
