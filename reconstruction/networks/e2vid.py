@@ -75,7 +75,7 @@ class UNet(nn.Module):
 
     def forward(self, voxels: torch.Tensor, state: State | None) -> tuple[torch.Tensor, State]:
         head = self.head(voxels)
-        before = [None] * len(self.encoders) if not state else state
+        before = state or [None] * len(self.encoders)
         x, encoded, after = head, [], []
         for encoder, remembered in zip(self.encoders, before, strict=True):
             if self.recurrent:

@@ -1,4 +1,4 @@
-"""One thread per test process: torch's threads wait for each other by spinning, which costs most where cores are few."""
+"""One thread per test process: torch's threads wait for each other by spinning, which costs where cores are few."""
 
 import pytest
 import torch

@@ -64,7 +64,7 @@ def test_the_network_computes_what_its_equations_say(case: int) -> None:
     assert float(images[0].std()) > 1e-5  # it does show something
 
 
-# --- the layout of Stoffregen et al.: E2VID+ and FireNet+ --------------------------------------------------------------
+# --- the layout of Stoffregen et al.: E2VID+ and FireNet+ ---
 
 
 class ConfigParser:
