@@ -3,7 +3,8 @@
 Without arguments: simulate the built-in hybrid rig (two event cameras, two frame cameras, one IMU, a checkerboard),
 write it as ordinary recordings, calibrate it from those files alone, and print the result beside the truth.
 
-With --rig: calibrate what your rig.yaml names. All paths in it are relative to its folder:
+With --rig: calibrate what your rig.yaml names, as `jaxcal calibrate rig.yaml` does (see its --help for all that a
+rig.yaml can say). All paths in it are relative to its folder:
 
     target: target.yaml              # Kalibr's target.yaml, or its keys right here
     cameras:
@@ -38,6 +39,7 @@ from pathlib import Path
 import platformdirs
 
 import jaxcal
+from jaxcal.cli.outcome import show_calibration
 from jaxcal.cli.progress_bars import ProgressBars
 from jaxcal.pipeline import PipelineSettings, run_pipeline
 
@@ -54,7 +56,7 @@ def main() -> int:
         )
         calibration = run_pipeline(rig, arguments.output, settings=settings, workers=arguments.workers, progress=bars)
         bars.close()
-        print_result(calibration, rig.parent / "ground_truth.yaml", arguments.output)
+        show_calibration(calibration, arguments.output, ground_truth=rig.parent / "ground_truth.yaml")
         print(f"done in {time.monotonic() - start:.0f} s")
     except jaxcal.CalibrationError as error:
         bars.close()
@@ -83,23 +85,6 @@ def simulated_rig(recording: Path | None, bars: ProgressBars) -> Path:
 
     folder = recording or Path(platformdirs.user_cache_dir("jaxcal")) / "recordings" / "paper_rig"
     return write_recording(paper_rig(), folder, progress=bars, workers=2)
-
-
-def print_result(calibration: jaxcal.Calibration, ground_truth: Path, output: Path) -> None:
-    """The summary, the comparison with the truth where there is one, and where the files are."""
-    from jaxcal.results import results_text
-    from jaxcal.results.ground_truth import compare_with_ground_truth, comparison_table
-
-    if ground_truth.exists():  # written by the simulator, and read only now that the calibration is finished
-        print(comparison_table(compare_with_ground_truth(calibration, ground_truth)))
-        for camera in calibration.cameras:
-            print(f"{camera.name}: reprojection error {camera.reprojection_rms_px:.3f} px rms")
-    else:
-        print(results_text(calibration))
-    for warning in calibration.warnings:
-        print(f"warning: {warning}")
-    print(f"report: {(output / 'report.html').resolve()}")
-    print(f"all results: {output.resolve()}")
 
 
 if __name__ == "__main__":

@@ -46,7 +46,10 @@ ALLOWED: dict[str, set[str]] = {
         "jaxcal.recording",
     }
     | OBSERVATIONS,
+    # The section of a rig.yaml that holds a job's arguments, which are the job's to name.
+    "jaxcal.job_options": {"jaxcal.recording", "jaxcal.calibration", "jaxcal.results", "jaxcal.targets"},
     "jaxcal.pipeline": {
+        "jaxcal.job_options",
         "jaxcal.recording",
         "jaxcal.detection",
         "jaxcal.calibration",

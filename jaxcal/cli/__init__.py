@@ -4,6 +4,7 @@ from typing import Any
 
 import click
 
+from jaxcal.cli.calibrate import calibrate
 from jaxcal.cli.calibrate_cameras import calibrate_cameras
 from jaxcal.cli.compare import compare
 from jaxcal.cli.convert import convert
@@ -68,6 +69,7 @@ convert.add_command(convert_calibration)
 main.add_command(convert)
 main.add_command(info)
 main.add_command(imu_noise)
+main.add_command(calibrate)
 main.add_command(calibrate_cameras)
 main.add_command(compare)
 main.add_command(report)

@@ -1,6 +1,8 @@
-"""Images with times: from EuRoC/ASL folders, from files named by their time in nanoseconds, from bags."""
+"""Images with times: from EuRoC/ASL folders, from files named by their time or by a number, from bags."""
 
 import csv
+import glob
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,8 +19,11 @@ from jaxcal.recording.yaml_files import located
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
 _EXPECTED = (
     "Expected an EuRoC/ASL folder (data.csv beside data/), image files named by their time in ns, or a bag: "
-    "FILE.bag:/cam0/image_raw."
+    "FILE.bag:/cam0/image_raw, or a pattern of file names with a number in each: left*.png."
 )
+# Images that carry no time but a number are taken this far apart.
+_STEP_NS = 100_000_000
+_LEAST_TIME_NS = 10**12  # a number as large is a time
 
 
 @dataclass(frozen=True)
@@ -80,9 +85,13 @@ def load_frames(folder: str | Path) -> Frames:
 
     `folder` is an EuRoC/ASL camera folder (`data.csv` with lines 'time in ns, file name', and `data/`), a bare folder
     of images named `<time in ns>.png`, or a bag of ROS 1, ROS 2 or mcap: `FILE.bag:/cam0/image_raw`, where the topic
-    may be left out if only one has images. Raises CalibrationError when there are no images, a file that data.csv names
-    is missing, a name is no time, or times do not increase.
+    may be left out if only one has images. Or it is a pattern of file names, `calib/left*.jpg`: the last number in each
+    name stands for its time, in nanoseconds where it is as large as that, else in steps of 0.1 s. Raises
+    CalibrationError when there are no images, a file that data.csv names is missing, a name is no time, or times do not
+    increase.
     """
+    if is_pattern(folder):
+        return _numbered(str(folder))
     folder, topic = split_place(folder)
     if is_bag(folder):
         return load_bag_frames(folder, topic)
@@ -96,6 +105,30 @@ def load_frames(folder: str | Path) -> Frames:
     image_size = (first.shape[1], first.shape[0])
     with located(str(folder)):
         return Frames(np.array(times, dtype=np.int64), ImageFiles(tuple(paths), image_size), image_size)
+
+
+def is_pattern(path: str | Path) -> bool:
+    """Whether a path is a pattern of file names, rather than the name of a file or folder."""
+    return glob.has_magic(str(path)) and not split_place(path)[0].exists()
+
+
+def _numbered(pattern: str) -> Frames:
+    numbered: dict[int, Path] = {}
+    for path in sorted(Path(found) for found in glob.glob(pattern)):
+        digits = re.findall(r"\d+", path.stem)
+        if not digits:
+            raise CalibrationError(f"{path}: no number in the name; images of one moment are matched by it. Rename it.")
+        number = int(digits[-1])
+        if number in numbered:
+            raise CalibrationError(f"{path}: has the number of {numbered[number]}. Give a narrower pattern.")
+        numbered[number] = path
+    if not numbered:
+        raise CalibrationError(f"{pattern}: no such images. Quote the pattern, and check the folder.")
+    numbers = sorted(numbered)
+    height, width = read_grey(numbered[numbers[0]]).shape
+    paths = tuple(numbered[number] for number in numbers)
+    step = 1 if numbers[-1] >= _LEAST_TIME_NS else _STEP_NS
+    return Frames(np.array(numbers, np.int64) * step, ImageFiles(paths, (width, height)), (width, height))
 
 
 def _listed(listing: Path) -> tuple[list[int], list[Path]]:

@@ -1,8 +1,10 @@
-"""rig.yaml: which cameras and IMU were recorded, where their files are, and what stood in front of them."""
+"""rig.yaml: which cameras and IMUs were recorded, where their files are, and what stood in front of them."""
 
+import difflib
+import glob
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +15,14 @@ from jaxcal.recording.images import load_frames
 from jaxcal.recording.imu import load_imu, load_noise, noise_from_yaml
 from jaxcal.recording.places import split_place
 from jaxcal.recording.tables import load_detections
-from jaxcal.recording.yaml_files import as_mapping, as_positive, as_text, check_keys, read_mapping
+from jaxcal.recording.yaml_files import as_bool, as_mapping, as_positive, as_span, as_text, check_keys, read_mapping
 from jaxcal.targets import Target, load_target, target_from_yaml
 
 _SOURCES = ("events", "frames", "detections")
-_CAMERA_KEYS = ("name", "model", *_SOURCES, "resolution", "prefix")
+_CAMERA_KEYS = ("name", "model", *_SOURCES, "resolution", "prefix", "rolling_shutter")
+# Kalibr's names of how an IMU measures (`jaxcal.imu` has what they mean), the plain one first.
+IMU_MODELS = ("calibrated", "scale-misalignment", "scale-misalignment-size-effect")
+_RIG_KEYS = ("target", "cameras", "imu", "imus", "reconstruction", "from_to", "frame_rate_hz", "calibration")
 
 
 @dataclass(frozen=True)
@@ -26,7 +31,8 @@ class RigCamera:
 
     `model` is a camera model's name; exactly one of `events` (a file of any event format), `frames` (a folder, or a
     topic of a bag) and `detections` (npz) is set; `prefix` names the columns of a corner table; `resolution` (width,
-    height) in pixels where rig.yaml gives it. Event files of some formats tell it themselves.
+    height) in pixels where rig.yaml gives it. Event files of some formats tell it themselves. `rolling_shutter`: its
+    rows are seen one after another.
     """
 
     name: str
@@ -36,6 +42,7 @@ class RigCamera:
     detections: Path | None = None
     resolution: tuple[int, int] | None = None
     prefix: str = ""
+    rolling_shutter: bool = False
 
     def open_events(self) -> EventFile:
         """The camera's event recording."""
@@ -71,10 +78,14 @@ class RigCamera:
 
 @dataclass(frozen=True)
 class RigImu:
-    """The IMU of a rig: `data` is an EuRoC csv, an npz table or a topic of a bag, `noise` its noise model."""
+    """An IMU of a rig: `data` is an EuRoC csv, an npz table or a topic of a bag, `noise` its noise model.
+
+    `model`: Kalibr's name of the measurement model, such as 'scale-misalignment'.
+    """
 
     data: Path
     noise: ImuNoise
+    model: str = "calibrated"
 
     def load(self) -> ImuRecording:
         """What the IMU recorded."""
@@ -91,33 +102,56 @@ class RigReconstruction:
 
 @dataclass(frozen=True)
 class Rig:
-    """A recorded rig: the file it was read from, the target, the cameras and an IMU or None."""
+    """A recorded rig: the file it was read from, the target, the cameras and the IMUs, none or more.
+
+    `from_to`: only this part of the recording is used, seconds after the first frame or event of any camera;
+    `frame_rate_hz`: at most so many images a second. `calibration`: arguments of `calibrate_cameras` or
+    `calibrate_camera_imu`, as they stand in the file; whoever calibrates checks them.
+    """
 
     path: Path
     target: Target
     cameras: tuple[RigCamera, ...]
-    imu: RigImu | None = None
+    imus: tuple[RigImu, ...] = ()
     reconstruction: RigReconstruction = RigReconstruction()
+    from_to: tuple[float, float] | None = None
+    frame_rate_hz: float | None = None
+    calibration: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def imu(self) -> RigImu | None:
+        """The first IMU, whose frame and clock are the rig's."""
+        return self.imus[0] if self.imus else None
+
+    def span_ns(self, first_ns: Sequence[int]) -> tuple[int, int] | None:
+        """First and last time of the part to use, for cameras whose recordings begin at `first_ns`; None: all."""
+        if self.from_to is None:
+            return None
+        start = min(int(t) for t in first_ns)
+        return start + round(self.from_to[0] * 1e9), start + round(self.from_to[1] * 1e9)
 
 
 def load_rig(path: str | Path) -> Rig:
     """Read a rig.yaml. Paths in it are relative to its folder; every file that it names must exist.
 
     Raises CalibrationError, with the key's path, for unknown or missing keys, values of the wrong kind, no cameras,
-    two cameras of one name, and missing files.
+    two cameras of one name, and missing files. The arguments below `calibration` are checked where they are used.
     """
     path = Path(path)
     content = read_mapping(path, "rig")
     where = str(path)
-    check_keys(content, ("target", "cameras", "imu", "reconstruction"), where, required=("target", "cameras"))
+    check_keys(content, _RIG_KEYS, where, required=("target", "cameras"))
     folder = path.resolve().parent
-    imu, reconstruction = content.get("imu"), content.get("reconstruction")
+    reconstruction, rate = content.get("reconstruction"), content.get("frame_rate_hz")
     return Rig(
         path=path,
         target=_target(content["target"], folder, f"{where}: target"),
         cameras=_cameras(content["cameras"], folder, f"{where}: cameras"),
-        imu=None if imu is None else _imu(as_mapping(imu, f"{where}: imu"), folder, f"{where}: imu"),
+        imus=_imus(content, folder, where),
         reconstruction=_reconstruction(reconstruction or {}, folder, f"{where}: reconstruction"),
+        from_to=None if content.get("from_to") is None else as_span(content["from_to"], f"{where}: from_to"),
+        frame_rate_hz=None if rate is None else as_positive(rate, f"{where}: frame_rate_hz"),
+        calibration=as_mapping(content.get("calibration") or {}, f"{where}: calibration"),
     )
 
 
@@ -160,18 +194,40 @@ def _camera(content: Any, folder: Path, where: str) -> RigCamera:
         model=as_text(content["model"], f"{where}.model"),
         resolution=None if resolution is None else _resolution(resolution, f"{where}.resolution"),
         prefix=as_text(content["prefix"], f"{where}.prefix") if "prefix" in content else "",
+        rolling_shutter=as_bool(content.get("rolling_shutter", False), f"{where}.rolling_shutter"),
         **{source: _existing(content[source], folder, f"{where}.{source}")},
     )
 
 
-def _imu(content: Mapping[str, Any], folder: Path, where: str) -> RigImu:
-    check_keys(content, ("data", "noise"), where, required=("data", "noise"))
+def _imus(content: Mapping[str, Any], folder: Path, where: str) -> tuple[RigImu, ...]:
+    """What `imu`, a mapping or a list, or `imus` says."""
+    if content.get("imu") is not None and content.get("imus") is not None:
+        raise CalibrationError(f"{where}: give 'imu' or 'imus', not both.")
+    key = "imu" if content.get("imu") is not None else "imus"
+    found = content.get(key)
+    if found is None:
+        return ()
+    if isinstance(found, Mapping):
+        return (_imu(found, folder, f"{where}: {key}"),)
+    if not isinstance(found, Sequence) or isinstance(found, str):
+        raise CalibrationError(f"{where}: {key}: expected 'data:' and 'noise:', or a list of IMUs with them.")
+    return tuple(_imu(entry, folder, f"{where}: {key}[{index}]") for index, entry in enumerate(found))
+
+
+def _imu(content: Any, folder: Path, where: str) -> RigImu:
+    content = as_mapping(content, where)
+    check_keys(content, ("data", "noise", "model"), where, required=("data", "noise"))
+    kind = content.get("model", IMU_MODELS[0])
+    if kind not in IMU_MODELS:
+        close = difflib.get_close_matches(str(kind), IMU_MODELS, n=1)
+        hint = f" Did you mean '{close[0]}'?" if close else ""
+        raise CalibrationError(f"{where}.model: '{kind}' is unknown.{hint} Known: {', '.join(IMU_MODELS)}.")
     noise = content["noise"]
     if isinstance(noise, Mapping):
         model = noise_from_yaml(noise, f"{where}.noise")
     else:
         model = load_noise(_existing(noise, folder, f"{where}.noise"))
-    return RigImu(data=_existing(content["data"], folder, f"{where}.data"), noise=model)
+    return RigImu(data=_existing(content["data"], folder, f"{where}.data"), noise=model, model=kind)
 
 
 def _reconstruction(content: Any, folder: Path, where: str) -> RigReconstruction:
@@ -186,7 +242,7 @@ def _reconstruction(content: Any, folder: Path, where: str) -> RigReconstruction
 
 def _existing(content: Any, folder: Path, where: str) -> Path:
     path = folder / Path(os.path.expandvars(as_text(content, where))).expanduser()
-    if not split_place(path)[0].exists():
+    if not split_place(path)[0].exists() and not glob.glob(str(path)):
         raise CalibrationError(f"{where}: {path} does not exist. Paths are relative to the rig file's folder.")
     return path
 

@@ -68,6 +68,24 @@ def as_positive(content: Any, where: str) -> float:
     return value
 
 
+def as_bool(content: Any, where: str) -> bool:
+    """`content` if it is true or false."""
+    if not isinstance(content, bool):
+        raise CalibrationError(f"{where}: expected true or false, found {_short(content)}.")
+    return content
+
+
+def as_span(content: Any, where: str) -> tuple[float, float]:
+    """`content` as a start and a later end, in seconds."""
+    values = list(content) if isinstance(content, (list, tuple)) else []
+    numbers = [float(v) for v in values if isinstance(v, (int, float)) and not isinstance(v, bool)]
+    if len(values) != 2 or len(numbers) != 2 or not 0 <= numbers[0] < numbers[1] < float("inf"):
+        raise CalibrationError(
+            f"{where}: expected [start, end] in seconds after the first frame, found {_short(content)}."
+        )
+    return numbers[0], numbers[1]
+
+
 @contextlib.contextmanager
 def located(where: str) -> Iterator[None]:
     """Put `where` in front of the message of any CalibrationError raised inside."""

@@ -183,6 +183,34 @@ def test_frames_carry_the_end_of_their_window(
             assert np.all(frames.images[index] == expected)
 
 
+def test_a_part_of_the_recording(event_rig: Path, network: SimpleNamespace, handed_over: dict[str, Frames]) -> None:
+    times = T0_US * 1000 + np.arange(20) * 10_000_000
+    (event_rig.parent / "cam2").mkdir()
+    for t in times:
+        cv2.imwrite(str(event_rig.parent / "cam2" / f"{t}.png"), np.zeros((24, 32), np.uint8))
+    content = yaml.safe_load(event_rig.read_text()) | {"from_to": [0.05, 0.15], "frame_rate_hz": 50}
+    content["cameras"].append({"name": "cam2", "model": "pinhole-radtan", "frames": "cam2"})
+    event_rig.write_text(yaml.safe_dump(content))
+    walk(event_rig, PipelineSettings(window_ms=10.0))
+    for name in ("cam0", "cam1", "cam2"):
+        since = handed_over[name].timestamps_ns - times[0]
+        assert len(since) in (5, 6)
+        assert since.min() >= 50_000_000
+        assert since.max() <= 150_000_000
+    assert max(count for _, count in network.windows) < 600  # the first window does not hold all that was skipped
+    event_rig.write_text(yaml.safe_dump(content | {"from_to": [5, 6]}))
+    with pytest.raises(CalibrationError, match=r"cam2: no frame lies between 5.00 s and 6.00 s"):
+        run_pipeline(event_rig, event_rig.parent / "out", settings=FAST)
+
+
+def test_options_of_the_job_are_checked_before_any_work(event_rig: Path, network: SimpleNamespace) -> None:
+    content = yaml.safe_load(event_rig.read_text())
+    event_rig.write_text(yaml.safe_dump(content | {"calibration": {"vews": 20}}))
+    with pytest.raises(CalibrationError, match=r"rig.yaml: calibration: unknown key 'vews'. Did you mean 'views'"):
+        run_pipeline(event_rig, event_rig.parent / "out", settings=FAST)
+    assert not network.windows
+
+
 def test_frames_are_made_once(event_rig: Path, network: SimpleNamespace, handed_over: dict[str, Frames]) -> None:
     walk(event_rig)
     made = len(network.windows)

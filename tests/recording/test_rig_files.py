@@ -89,6 +89,34 @@ def test_the_imu_and_reconstruction_are_optional(tmp_path: Path, content: dict[s
     assert rig.reconstruction.window_ms is None
 
 
+def test_several_imus_options_and_a_part_of_the_recording(tmp_path: Path, content: dict[str, Any]) -> None:
+    one = content.pop("imu")
+    content["imus"] = [one, one | {"model": "scale-misalignment"}]
+    content["cameras"][1]["rolling_shutter"] = True
+    content |= {"from_to": [1, 2.5], "frame_rate_hz": 4, "calibration": {"imu_noise": "given"}}
+    rig = load_rig(write(tmp_path, content))
+    assert [imu.model for imu in rig.imus] == ["calibrated", "scale-misalignment"]
+    assert rig.imu == rig.imus[0]
+    assert [camera.rolling_shutter for camera in rig.cameras] == [False, True, False]
+    assert rig.span_ns([5_000_000_000, 4_000_000_000]) == (5_000_000_000, 6_500_000_000)
+    assert rig.frame_rate_hz == 4.0
+    assert rig.calibration == {"imu_noise": "given"}
+    alone = load_rig(write(tmp_path, content | {"imus": one, "from_to": None}))
+    assert len(alone.imus) == 1
+    assert alone.span_ns([0]) is None
+
+
+def test_images_by_a_pattern_of_names(tmp_path: Path, content: dict[str, Any]) -> None:
+    for name in ("left03.png", "left10.png", "right03.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((4, 6), np.uint8))
+    content["cameras"][1]["frames"] = "left*.png"
+    frames = load_rig(write(tmp_path, content)).cameras[1].load_frames()
+    assert frames.timestamps_ns.tolist() == [300_000_000, 1_000_000_000]
+    content["cameras"][1]["frames"] = "middle*.png"
+    with pytest.raises(CalibrationError, match=r"middle\*.png does not exist"):
+        load_rig(write(tmp_path, content))
+
+
 def change(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
     """A function that sets (or, for None, removes) the value at a dotted path."""
 
@@ -127,6 +155,18 @@ def change(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
         ("imu.nois", "imu.yaml", "rig.yaml: imu: unknown key 'nois'. Did you mean 'noise'"),
         ("imu.data", None, "imu: 'data' is missing"),
         ("imu.noise", {**NOISE, "gyroscope_noise_density": "x"}, "imu.noise: gyroscope_noise_density: expected a pos"),
+        (
+            "imu.model",
+            "scale-misalignmnt",
+            "imu.model: 'scale-misalignmnt' is unknown. Did you mean 'scale-misalignment'",
+        ),
+        ("imu", "imu.csv", "imu: expected 'data:' and 'noise:', or a list"),
+        ("imus", [], "give 'imu' or 'imus', not both"),
+        ("cameras.0.rolling_shutter", "yes", r"cameras\[0\].rolling_shutter: expected true or false"),
+        ("from_to", [3, 2], r"rig.yaml: from_to: expected \[start, end\] in seconds"),
+        ("from_to", 3, r"from_to: expected \[start, end\]"),
+        ("frame_rate_hz", 0, "frame_rate_hz: expected a positive number"),
+        ("calibration", ["views"], "calibration: expected 'key: value' lines"),
         ("reconstruction.window", 20, "reconstruction: unknown key 'window'. Did you mean 'window_ms'"),
         ("reconstruction.window_ms", 0, "reconstruction.window_ms: expected a positive number"),
         ("reconstruction.network", "absent.safetensors", "reconstruction.network: .* does not exist"),

@@ -1,5 +1,6 @@
 """Calibrations in the files of other tools: Kalibr, OpenVINS, VINS-Fusion, Basalt, ROS, OpenCV, COLMAP."""
 
+from jaxcal.results.interchange.bare import bare_calibration, calibration_of_file
 from jaxcal.results.interchange.formats import (
     FORMATS,
     Written,
@@ -17,6 +18,8 @@ __all__ = [
     "KalibrResults",
     "RigImu",
     "Written",
+    "bare_calibration",
+    "calibration_of_file",
     "load_calibration_or_rig",
     "read_calibration",
     "read_kalibr_results",
