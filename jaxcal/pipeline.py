@@ -115,9 +115,9 @@ def _calibrated(
         "progress": progress,
     }
     if not imus:
-        return calibrate_cameras(detections, rig.target, **(more | options))
+        return calibrate_cameras(detections, rig.target, **(more | dict(options)))
     more["imu_models"] = [imu.model for imu in rig.imus]
-    return calibrate_camera_imu(detections, imus, rig.target, **(more | options))
+    return calibrate_camera_imu(detections, imus, rig.target, **(more | dict(options)))
 
 
 def _cache_folder(beside: Path, output: Path) -> Path:
