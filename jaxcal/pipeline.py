@@ -1,36 +1,26 @@
 """The corridor from a rig.yaml to a `Calibration`: frames from events, corners from frames, one joint estimate."""
 
 import contextlib
-import csv
-import hashlib
-import json
-import os
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-
-import cv2
-import numpy as np
 
 from jaxcal.calibration import calibrate_camera_imu, calibrate_cameras
 from jaxcal.cameras import camera_model
 from jaxcal.detection import detect
-from jaxcal.errors import CalibrationError
+from jaxcal.event_frames import frames_key, write_event_frames
 from jaxcal.job_options import job_options
 from jaxcal.observations import Detections, Frames, ImuRecording
-from jaxcal.progress import Progress, no_progress, track
+from jaxcal.progress import Progress, no_progress
 from jaxcal.recording import EventFile, Rig, RigCamera, load_frames, load_rig
 from jaxcal.recording.cut import cut_detections, cut_frames
+from jaxcal.recording.windows import WindowPlan
 from jaxcal.recording.yaml_files import located
 from jaxcal.results import Calibration
 from jaxcal.results.report import write_report
-
-# Raised whenever the same events could give other frames than before, apart from the network and the options.
-_FRAMES_VERSION = 1
-_MAX_WINDOWS = 500_000
 
 
 @dataclass(frozen=True)
@@ -40,8 +30,8 @@ class PipelineSettings:
     `window_ms`: length of the windows of events that become one frame each, when rig.yaml does not say. `cache`: the
     folder for reconstructed frames and detections; None: `.jaxcal` beside rig.yaml, or in the output folder where
     that cannot be written. `camera_imu`, `cameras`: arguments of `calibrate_camera_imu` and `calibrate_cameras`, which
-    go before what rig.yaml says below `calibration`. `reconstructor`: options of `reconstruction.Reconstructor`.
-    `report`: write report.html.
+    go before what rig.yaml says below `calibration`. `reconstructor`: options of `reconstruction.Reconstructor`, which
+    go before those below `reconstruction`. `report`: write report.html.
     """
 
     window_ms: float = 33.0
@@ -169,115 +159,42 @@ def _from_events(
     import reconstruction  # imports torch, which takes seconds: only where there are events
 
     network = reconstruction.load_network(rig.reconstruction.network)
-    window_ns = round((rig.reconstruction.window_ms or settings.window_ms) * 1e6)
-    # Without an IMU, cameras are tied together by views at the same time: those of the frames, where there are any.
-    shared = next(iter(recorded.values())).timestamps_ns if not rig.imus and recorded else None
+    times, source = rig.reconstruction.times, rig.reconstruction.times.stamps_of
+    if set(times.chosen()) <= {"window_ms"} and not rig.imus and recorded:
+        # Without an IMU, cameras are tied together by views at the same time: those of the frames, where there are any.
+        source = next(iter(recorded))
+        times = replace(times, window_ms=None, stamps_of=source)
+    times = times.or_windows_of(settings.window_ms)
+    stamps = None if source is None else recorded[source].timestamps_ns
     made = {}
     for camera in rig.cameras:
         if camera.events is None:
             continue
         events = opened[camera.name]
-        ends = _window_ends(events, window_ns, shared)
-        start_ns = None
-        if span_ns is not None:
-            start_ns = span_ns[0]
-            ends = ends[(ends > start_ns) & (ends <= span_ns[1])]
-        made[camera.name] = _reconstructed(camera, events, start_ns, ends, network, settings, cache, progress)
+        plan = times.plan(events, stamps, span_ns)
+        made[camera.name] = _reconstructed(rig, camera, events, plan, network, settings, cache, progress)
     return made
 
 
-def _window_ends(events: EventFile, window_ns: int, shared: np.ndarray | None) -> np.ndarray:
-    """When the windows of an event camera end: at shared times, or at whole multiples of the window's length.
-
-    Multiples make the frames of several event cameras simultaneous, as far as their clocks agree.
-    """
-    if shared is not None:
-        return shared[(shared > events.first_ns) & (shared <= events.last_ns)]
-    first, last = events.first_ns // window_ns + 1, events.last_ns // window_ns
-    if last - first > _MAX_WINDOWS:
-        raise CalibrationError(
-            f"{events.path}: the events span {(events.last_ns - events.first_ns) * 1e-9:.0f} s, which is "
-            f"{last - first} windows of {window_ns * 1e-6:g} ms. Are the time stamps in microseconds and free of jumps?"
-        )
-    ends = np.arange(first, last + 1, dtype=np.int64) * window_ns
-    if not len(ends):
-        raise CalibrationError(
-            f"{events.path}: the recording is {(events.last_ns - events.first_ns) * 1e-6:.1f} ms long, shorter than "
-            f"one window of {window_ns * 1e-6:g} ms. Record for longer: 20 s and more make a good calibration."
-        )
-    return ends
-
-
 def _reconstructed(
+    rig: Rig,
     camera: RigCamera,
     events: EventFile,
-    start_ns: int | None,
-    ends: np.ndarray,
+    plan: WindowPlan,
     network: Any,
     settings: PipelineSettings,
     cache: Path,
     progress: Progress,
 ) -> Frames:
-    """The frames of one event camera, in an EuRoC folder in `cache`; made unless they are there already.
-
-    The first window begins at `start_ns`, by default at the first event.
-
-    The folder appears when all frames are in it. An interrupted reconstruction starts again: the network's state
-    depends on all events before.
-    """
-    key = _frames_key(events, start_ns, ends, network, settings)
-    folder = cache / "frames" / f"{camera.name}-{key[:16]}"
+    """The frames of one event camera, in an EuRoC folder in `cache`; made unless they are there already."""
+    options = {**rig.reconstruction.options, **settings.reconstructor}
+    folder = cache / "frames" / f"{camera.name}-{frames_key(events, plan, network, options)[:16]}"
     stage = f"reconstruct {camera.name}"
     if folder.is_dir():
-        progress(stage, len(ends), len(ends))
+        progress(stage, plan.count(events), plan.count(events))
     else:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f"{camera.name}-", suffix=".part") as name:
-            part = Path(name) / "frames"
-            _write_frames(part, events, start_ns, ends, network, settings, stage, progress)
-            os.replace(part, folder)
+        write_event_frames(folder, events, plan, network, options, stage=stage, progress=progress)
         for old in folder.parent.glob(f"{camera.name}-{'[0-9a-f]' * 16}"):
             if old != folder:
                 shutil.rmtree(old, ignore_errors=True)
     return load_frames(folder)
-
-
-def _write_frames(
-    folder: Path,
-    events: EventFile,
-    start_ns: int | None,
-    ends: np.ndarray,
-    network: Any,
-    settings: PipelineSettings,
-    stage: str,
-    progress: Progress,
-) -> None:
-    import reconstruction
-
-    (folder / "data").mkdir(parents=True)
-    windows = events.windows_ending(ends.tolist(), start_ns)
-    frames = reconstruction.reconstruct(
-        windows, network, width=events.width, height=events.height, **settings.reconstructor
-    )
-    with (folder / "data.csv").open("w", newline="") as listing:
-        table = csv.writer(listing, lineterminator="\n")
-        table.writerow(["#timestamp [ns]", "filename"])
-        for t_ns, image in track(frames, stage, len(ends), progress):
-            path = folder / "data" / f"{t_ns}.png"
-            if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-                raise CalibrationError(f"{path}: the frame could not be written. Is the disk full?")
-            table.writerow([t_ns, path.name])
-
-
-def _frames_key(
-    events: EventFile, start_ns: int | None, ends: np.ndarray, network: Any, settings: PipelineSettings
-) -> str:
-    """A hash of all that the frames depend on: the event file, the windows, the network's weights and the options."""
-    digest = hashlib.sha256()
-    facts = [_FRAMES_VERSION, *events.fingerprint(), events.width, events.height]
-    digest.update(json.dumps([*facts, type(network).__name__, dict(settings.reconstructor)], default=str).encode())
-    digest.update(json.dumps(start_ns).encode() + ends.astype(np.int64).tobytes())
-    for name, values in sorted(network.state_dict().items()):
-        digest.update(name.encode())
-        digest.update(values.detach().cpu().numpy().tobytes())
-    return digest.hexdigest()

@@ -48,7 +48,9 @@ ALLOWED: dict[str, set[str]] = {
     | OBSERVATIONS,
     # The section of a rig.yaml that holds a job's arguments, which are the job's to name.
     "jaxcal.job_options": {"jaxcal.recording", "jaxcal.calibration", "jaxcal.results", "jaxcal.targets"},
+    "jaxcal.event_frames": {"jaxcal.recording", "reconstruction"} | OBSERVATIONS,
     "jaxcal.pipeline": {
+        "jaxcal.event_frames",
         "jaxcal.job_options",
         "jaxcal.recording",
         "jaxcal.detection",

@@ -6,13 +6,16 @@ from jaxcal.recording.events import EventFile
 from jaxcal.recording.formats.contract import EventColumns, Triggers
 from jaxcal.recording.images import ImageFiles, load_frames
 from jaxcal.recording.imu import load_imu, load_noise
-from jaxcal.recording.rig import Rig, RigCamera, RigImu, RigReconstruction, load_rig
+from jaxcal.recording.rig import Rig, RigCamera, RigImu, load_rig
+from jaxcal.recording.rig_reconstruction import RigReconstruction
 from jaxcal.recording.tables import load_detections
+from jaxcal.recording.windows import FrameTimes
 
 __all__ = [
     "EventColumns",
     "EventFacts",
     "EventFile",
+    "FrameTimes",
     "ImageFiles",
     "Rig",
     "RigCamera",

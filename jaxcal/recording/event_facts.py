@@ -105,6 +105,20 @@ def event_facts(events: EventFile, gap_s: float = 0.05, progress: Progress = no_
     return _facts(events, tally)
 
 
+def find_hot_pixels(events: EventFile, progress: Progress = no_progress) -> tuple[HotPixel, ...]:
+    """The pixels that fire far more often than those around them, most active first; reads the recording once."""
+    tally = _Tally()
+    stage, rough = f"hot pixels {events.path.name}", events.rough_count()
+    progress(stage, 0, rough)
+    done = 0
+    for piece in events.columns():
+        _count_pixels(tally, piece, events.size)
+        done += len(piece)
+        progress(stage, done, max(rough, done))
+    progress(stage, done, done)
+    return _hot_pixels(tally.activity)
+
+
 def _count(tally: _Tally, piece: EventColumns, size: tuple[int, int] | None, gap_ns: int) -> None:
     if tally.last is None:
         tally.first_ns = tally.earliest_ns = tally.latest_ns = int(piece.t_ns[0])

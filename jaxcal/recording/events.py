@@ -185,6 +185,30 @@ class EventFile:
         for remark in self.remarks():
             _log.warning("%s: %s", self.path, remark)
 
+    def windows_of(
+        self, number: int, t0_ns: int | None = None, t1_ns: int | None = None
+    ) -> Iterator[tuple[int, Events]]:
+        """Consecutive windows of `number` events each of t0_ns <= t < t1_ns, as (end, events); the last one has what is
+        left.
+
+        Events of one time stay together, so that a window may hold more. A window ends (exclusively) 1 ns after its
+        last event. At the end, the reader's remarks are logged as warnings.
+        """
+        if number < 1:
+            raise CalibrationError(f"{self.path}: windows of {number} events; expected at least one.")
+        self._known_size()
+        waiting: list[EventColumns] = []
+        for piece in self.columns(t0_ns, t1_ns):
+            waiting.append(piece)
+            # A window is complete when an event that is later than its last one has been read.
+            while (last := _time_of(waiting, number - 1)) is not None and last < int(piece.t_ns[-1]):
+                inside, waiting = _cut(waiting, last + 1)
+                yield last + 1, self._events(inside)
+        if waiting:
+            yield int(waiting[-1].t_ns[-1]) + 1, self._events(waiting)
+        for remark in self.remarks():
+            _log.warning("%s: %s", self.path, remark)
+
     def _events(self, pieces: list[EventColumns]) -> Events:
         width, height = self._known_size()
         if not pieces:
@@ -243,6 +267,15 @@ def _between(piece: EventColumns, t0_ns: int | None, t1_ns: int | None) -> Event
     low = 0 if t0_ns is None else int(np.searchsorted(piece.t_ns, t0_ns, side="left"))
     high = len(piece) if t1_ns is None else int(np.searchsorted(piece.t_ns, t1_ns, side="left"))
     return piece if (low, high) == (0, len(piece)) else piece.part(low, max(low, high))
+
+
+def _time_of(pieces: list[EventColumns], index: int) -> int | None:
+    """The time of the event of that index in all pieces together; None behind their end."""
+    for piece in pieces:
+        if index < len(piece):
+            return int(piece.t_ns[index])
+        index -= len(piece)
+    return None
 
 
 def _cut(pieces: list[EventColumns], end_ns: int) -> tuple[list[EventColumns], list[EventColumns]]:

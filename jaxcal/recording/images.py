@@ -100,7 +100,7 @@ def load_frames(folder: str | Path) -> Frames:
     if not folder.is_dir():
         raise CalibrationError(f"{folder}: no such image folder. {_EXPECTED}")
     listing = folder / "data.csv"
-    times, paths = _listed(listing) if listing.is_file() else _named_by_time(folder)
+    times, paths = listed_images(listing) if listing.is_file() else _named_by_time(folder)
     first = read_grey(paths[0])
     image_size = (first.shape[1], first.shape[0])
     with located(str(folder)):
@@ -131,7 +131,8 @@ def _numbered(pattern: str) -> Frames:
     return Frames(np.array(numbers, np.int64) * step, ImageFiles(paths, (width, height)), (width, height))
 
 
-def _listed(listing: Path) -> tuple[list[int], list[Path]]:
+def listed_images(listing: Path) -> tuple[list[int], list[Path]]:
+    """The times (ns) and files that an EuRoC `data.csv` names; CalibrationError where one is missing."""
     folder = listing.parent / "data"
     present = {entry.name for entry in folder.iterdir()} if folder.is_dir() else set()
     times: list[int] = []

@@ -1,8 +1,6 @@
 """rig.yaml: which cameras and IMUs were recorded, where their files are, and what stood in front of them."""
 
 import difflib
-import glob
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,9 +11,18 @@ from jaxcal.observations import Detections, Frames, ImuNoise, ImuRecording
 from jaxcal.recording.events import EventFile
 from jaxcal.recording.images import load_frames
 from jaxcal.recording.imu import load_imu, load_noise, noise_from_yaml
-from jaxcal.recording.places import split_place
+from jaxcal.recording.rig_reconstruction import RigReconstruction, reconstruction_from_yaml
 from jaxcal.recording.tables import load_detections
-from jaxcal.recording.yaml_files import as_bool, as_mapping, as_positive, as_span, as_text, check_keys, read_mapping
+from jaxcal.recording.yaml_files import (
+    as_bool,
+    as_mapping,
+    as_positive,
+    as_span,
+    as_text,
+    check_keys,
+    existing_path,
+    read_mapping,
+)
 from jaxcal.targets import Target, load_target, target_from_yaml
 
 _SOURCES = ("events", "frames", "detections")
@@ -93,14 +100,6 @@ class RigImu:
 
 
 @dataclass(frozen=True)
-class RigReconstruction:
-    """How frames are made from events: `window_ms` length of a window, `network` weights; None: the default."""
-
-    window_ms: float | None = None
-    network: Path | None = None
-
-
-@dataclass(frozen=True)
 class Rig:
     """A recorded rig: the file it was read from, the target, the cameras and the IMUs, none or more.
 
@@ -113,7 +112,7 @@ class Rig:
     target: Target
     cameras: tuple[RigCamera, ...]
     imus: tuple[RigImu, ...] = ()
-    reconstruction: RigReconstruction = RigReconstruction()
+    reconstruction: RigReconstruction = field(default_factory=RigReconstruction)
     from_to: tuple[float, float] | None = None
     frame_rate_hz: float | None = None
     calibration: Mapping[str, Any] = field(default_factory=dict)
@@ -143,22 +142,39 @@ def load_rig(path: str | Path) -> Rig:
     check_keys(content, _RIG_KEYS, where, required=("target", "cameras"))
     folder = path.resolve().parent
     reconstruction, rate = content.get("reconstruction"), content.get("frame_rate_hz")
-    return Rig(
+    rig = Rig(
         path=path,
         target=_target(content["target"], folder, f"{where}: target"),
         cameras=_cameras(content["cameras"], folder, f"{where}: cameras"),
         imus=_imus(content, folder, where),
-        reconstruction=_reconstruction(reconstruction or {}, folder, f"{where}: reconstruction"),
+        reconstruction=reconstruction_from_yaml(reconstruction or {}, folder, f"{where}: reconstruction"),
         from_to=None if content.get("from_to") is None else as_span(content["from_to"], f"{where}: from_to"),
         frame_rate_hz=None if rate is None else as_positive(rate, f"{where}: frame_rate_hz"),
         calibration=as_mapping(content.get("calibration") or {}, f"{where}: calibration"),
     )
+    _check_reconstruction(rig, f"{where}: reconstruction")
+    return rig
+
+
+def _check_reconstruction(rig: Rig, where: str) -> None:
+    """What the reconstruction says must fit the cameras."""
+    with_frames = [camera.name for camera in rig.cameras if camera.frames is not None]
+    source = rig.reconstruction.times.stamps_of
+    if source is not None and source not in with_frames:
+        raise CalibrationError(
+            f"{where}.stamps_of: '{source}' is no camera with 'frames'; those are {', '.join(with_frames) or 'none'}."
+        )
+    hot_pixels = rig.reconstruction.options.get("hot_pixels")
+    if hot_pixels not in (None, "auto") and sum(camera.events is not None for camera in rig.cameras) > 1:
+        raise CalibrationError(
+            f"{where}.hot_pixels: one file cannot serve several event cameras. Give 'auto', which finds those of each."
+        )
 
 
 def _target(content: Any, folder: Path, where: str) -> Target:
     if isinstance(content, Mapping):
         return target_from_yaml(content, where)
-    return load_target(_existing(content, folder, where))
+    return load_target(existing_path(content, folder, where))
 
 
 def _cameras(content: Any, folder: Path, where: str) -> tuple[RigCamera, ...]:
@@ -195,7 +211,7 @@ def _camera(content: Any, folder: Path, where: str) -> RigCamera:
         resolution=None if resolution is None else _resolution(resolution, f"{where}.resolution"),
         prefix=as_text(content["prefix"], f"{where}.prefix") if "prefix" in content else "",
         rolling_shutter=as_bool(content.get("rolling_shutter", False), f"{where}.rolling_shutter"),
-        **{source: _existing(content[source], folder, f"{where}.{source}")},
+        **{source: existing_path(content[source], folder, f"{where}.{source}")},
     )
 
 
@@ -226,25 +242,8 @@ def _imu(content: Any, folder: Path, where: str) -> RigImu:
     if isinstance(noise, Mapping):
         model = noise_from_yaml(noise, f"{where}.noise")
     else:
-        model = load_noise(_existing(noise, folder, f"{where}.noise"))
-    return RigImu(data=_existing(content["data"], folder, f"{where}.data"), noise=model, model=kind)
-
-
-def _reconstruction(content: Any, folder: Path, where: str) -> RigReconstruction:
-    content = as_mapping(content, where)
-    check_keys(content, ("window_ms", "network"), where)
-    window, network = content.get("window_ms"), content.get("network")
-    return RigReconstruction(
-        window_ms=None if window is None else as_positive(window, f"{where}.window_ms"),
-        network=None if network is None else _existing(network, folder, f"{where}.network"),
-    )
-
-
-def _existing(content: Any, folder: Path, where: str) -> Path:
-    path = folder / Path(os.path.expandvars(as_text(content, where))).expanduser()
-    if not split_place(path)[0].exists() and not glob.glob(str(path)):
-        raise CalibrationError(f"{where}: {path} does not exist. Paths are relative to the rig file's folder.")
-    return path
+        model = load_noise(existing_path(noise, folder, f"{where}.noise"))
+    return RigImu(data=existing_path(content["data"], folder, f"{where}.data"), noise=model, model=kind)
 
 
 def _resolution(content: Any, where: str) -> tuple[int, int]:

@@ -2,6 +2,8 @@
 
 import contextlib
 import difflib
+import glob
+import os
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,7 @@ from typing import Any
 import yaml
 
 from jaxcal.errors import CalibrationError
+from jaxcal.recording.places import split_place
 
 
 def read_mapping(path: Path, kind: str) -> Mapping[str, Any]:
@@ -84,6 +87,17 @@ def as_span(content: Any, where: str) -> tuple[float, float]:
             f"{where}: expected [start, end] in seconds after the first frame, found {_short(content)}."
         )
     return numbers[0], numbers[1]
+
+
+def existing_path(content: Any, folder: Path, where: str) -> Path:
+    """The path (or pattern of file names) that a rig names, relative to its folder, with ${VARIABLES} and ~ expanded.
+
+    Raises CalibrationError where there is no such file or folder.
+    """
+    path = folder / Path(os.path.expandvars(as_text(content, where))).expanduser()
+    if not split_place(path)[0].exists() and not glob.glob(str(path)):
+        raise CalibrationError(f"{where}: {path} does not exist. Paths are relative to the rig file's folder.")
+    return path
 
 
 @contextlib.contextmanager

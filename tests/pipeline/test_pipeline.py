@@ -114,11 +114,18 @@ def network(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     fake = SimpleNamespace(weight=1.0, windows=[])
 
     def reconstruct(
-        windows: Iterable[tuple[int, Events]], network: CountingNetwork, *, width: int, height: int
+        windows: Iterable[tuple[int, Events, bool]],
+        network: CountingNetwork,
+        *,
+        width: int,
+        height: int,
+        **options: Any,
     ) -> Iterator[tuple[int, np.ndarray]]:
-        for end, events in windows:
+        fake.options = options
+        for end, events, wanted in windows:
             fake.windows.append((end, len(events)))
-            yield end, np.full((height, width), len(events) % 256, np.uint8)
+            if wanted:
+                yield end, np.full((height, width), len(events) % 256, np.uint8)
 
     fake.load_network = lambda path=None: CountingNetwork(fake.weight)
     fake.reconstruct = reconstruct
@@ -280,6 +287,50 @@ def test_without_an_imu_event_frames_share_the_times_of_the_frames(
     shared = handed_over["cam0"].timestamps_ns
     assert len(shared) >= 7
     assert set(shared) <= set(times)
+
+
+def add_to_rig(rig: Path, **more: Any) -> None:
+    rig.write_text(yaml.safe_dump(yaml.safe_load(rig.read_text()) | more))
+
+
+def test_the_rig_says_how_frames_are_made(
+    event_rig: Path, network: SimpleNamespace, handed_over: dict[str, Frames]
+) -> None:
+    add_to_rig(event_rig, reconstruction={"rate_hz": 50, "upsample_rate": 3, "auto_hdr": True, "Imin": 0.1})
+    walk(event_rig, PipelineSettings(reconstructor={"auto_hdr": False}))
+    frames = handed_over["cam0"]
+    assert np.all(frames.timestamps_ns % 20_000_000 == 0)
+    per_camera = len(network.windows) / 2
+    assert 2.5 * len(frames) < per_camera <= 3 * len(frames)
+    assert network.options == {"auto_hdr": False, "Imin": 0.1}  # what is asked for in Python goes before the rig
+
+
+def test_hot_pixels_are_found_for_each_camera(
+    event_rig: Path, network: SimpleNamespace, handed_over: dict[str, Frames]
+) -> None:
+    with h5py.File(event_rig.parent / "cam1.h5", "a") as file:
+        for name, value in (("x", 5), ("y", 7)):
+            file[name][::20] = value  # pyright: ignore[reportIndexIssue]
+    walk(event_rig)
+    made = len(network.windows)
+    add_to_rig(event_rig, reconstruction={"hot_pixels": "auto"})
+    walk(event_rig)
+    assert network.options["hot_pixels"].tolist() == [[5, 7]]
+    assert len(network.windows) == 2 * made  # other options, other frames
+
+
+def test_event_frames_at_the_stamps_of_a_frame_camera(
+    event_rig: Path, network: SimpleNamespace, handed_over: dict[str, Frames]
+) -> None:
+    times = T0_US * 1000 + np.arange(1, 7) * 25_000_000 + 777
+    (event_rig.parent / "cam2").mkdir()
+    for t in times:
+        cv2.imwrite(str(event_rig.parent / "cam2" / f"{t}.png"), np.zeros((24, 32), np.uint8))
+    cameras = yaml.safe_load(event_rig.read_text())["cameras"]
+    cameras.append({"name": "cam2", "model": "pinhole-radtan", "frames": "cam2"})
+    add_to_rig(event_rig, cameras=cameras, reconstruction={"stamps_of": "cam2", "time_offset_ms": 2.5})
+    walk(event_rig)
+    assert np.array_equal(handed_over["cam0"].timestamps_ns, times + 2_500_000)
 
 
 def test_recordings_shorter_than_a_window_or_endless_are_refused(event_rig: Path, network: SimpleNamespace) -> None:

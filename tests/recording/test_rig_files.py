@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from jaxcal import AprilGrid, CalibrationError, Detections, load_rig
+from jaxcal.recording import FrameTimes
 
 TARGET = {"target_type": "aprilgrid", "tagRows": 6, "tagCols": 6, "tagSize": 0.088, "tagSpacing": 0.3}
 NOISE = {
@@ -168,6 +169,14 @@ def change(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
         ("frame_rate_hz", 0, "frame_rate_hz: expected a positive number"),
         ("calibration", ["views"], "calibration: expected 'key: value' lines"),
         ("reconstruction.window", 20, "reconstruction: unknown key 'window'. Did you mean 'window_ms'"),
+        ("reconstruction.rate_hz", 20, "reconstruction: window_ms and rate_hz each say when frames are wanted"),
+        ("reconstruction.stamps_off", "cam1", "unknown key 'stamps_off'. Did you mean 'stamps_of'"),
+        ("reconstruction.hotpixels", "auto", "unknown key 'hotpixels'. Did you mean 'hot_pixels'"),
+        ("reconstruction.hot_pixels", "absent.txt", "reconstruction.hot_pixels: .* does not exist"),
+        ("reconstruction.precision", "float8", "reconstruction.precision: expected one of auto, float32"),
+        ("reconstruction.upsample_rate", 1.5, "reconstruction.upsample_rate: expected a whole number"),
+        ("reconstruction.unsharp_mask_amount", -1, "reconstruction.unsharp_mask_amount: .* not negative"),
+        ("reconstruction.auto_hdr", "yes", "reconstruction.auto_hdr: expected true or false"),
         ("reconstruction.window_ms", 0, "reconstruction.window_ms: expected a positive number"),
         ("reconstruction.network", "absent.safetensors", "reconstruction.network: .* does not exist"),
     ],
@@ -194,3 +203,40 @@ def test_image_size_against_the_rig(tmp_path: Path, content: dict[str, Any]) -> 
     rig = load_rig(write(tmp_path, content))
     with pytest.raises(CalibrationError, match="the images are 6x4, but the rig says 640x480 for 'cam1'"):
         rig.cameras[1].load_frames()
+
+
+def test_the_reconstruction_is_read_in_full(tmp_path: Path, content: dict[str, Any]) -> None:
+    (tmp_path / "times.txt").write_text("1\n2\n")
+    (tmp_path / "hot.txt").write_text("3,1\n")
+    content["reconstruction"] = {
+        "timestamps": "times.txt",
+        "time_offset_ms": -1.5,
+        "upsample_rate": 4,
+        "hot_pixels": "hot.txt",
+        "unsharp_mask_amount": 0,
+        "auto_hdr": True,
+        "precision": "bfloat16",
+        "device": "cpu",
+    }
+    reconstruction = load_rig(write(tmp_path, content)).reconstruction
+    expected = FrameTimes(timestamps=tmp_path / "times.txt", time_offset_ms=-1.5, upsample_rate=4)
+    assert reconstruction.times == expected
+    assert reconstruction.options == {
+        "unsharp_mask_amount": 0.0,
+        "auto_hdr": True,
+        "precision": "bfloat16",
+        "device": "cpu",
+        "hot_pixels": str(tmp_path / "hot.txt"),
+    }
+
+
+def test_the_reconstruction_must_fit_the_cameras(tmp_path: Path, content: dict[str, Any]) -> None:
+    content["reconstruction"] = {"stamps_of": "cam1"}
+    assert load_rig(write(tmp_path, content)).reconstruction.times.stamps_of == "cam1"
+    content["reconstruction"] = {"stamps_of": "cam0"}
+    with pytest.raises(CalibrationError, match="stamps_of: 'cam0' is no camera with 'frames'; those are cam1"):
+        load_rig(write(tmp_path, content))
+    content["reconstruction"] = {"hot_pixels": "table.npz"}
+    content["cameras"].append({"name": "cam3", "model": "pinhole-radtan", "events": "events.h5"})
+    with pytest.raises(CalibrationError, match="hot_pixels: one file cannot serve several event cameras"):
+        load_rig(write(tmp_path, content))
