@@ -14,6 +14,8 @@ from jaxtyping import Float, UInt8
 from scipy.stats import norm
 
 from jaxcal.errors import CalibrationError
+from reconstruction import voxel_torch
+from reconstruction.colour import bayer_places, merged
 from reconstruction.networks import ReconstructionNetwork
 from reconstruction.networks.base import State
 from reconstruction.voxel import accumulate, normalise
@@ -40,9 +42,11 @@ class Reconstructor:
     - `hot_pixels`: (K, 2) columns and rows whose events are ignored, or the path of a text file with "x,y" lines.
     - `flip`: turn the image by half a turn. `no_normalize`: leave voxel grids unscaled. `no_recurrent`: forget the
       state after each window.
-    - `device`: 'cpu', 'cuda' ...; None for the CPU.
-    - `precision`: 'float32', 'bfloat16', or 'auto': bfloat16 where the network was trained in it and the machine
-      computes it in hardware. The last layer and all filters are in float32 in any case.
+    - `device`: 'cpu', 'cuda', 'cuda:1' ...; 'auto' for a GPU where there is one; None for the CPU.
+    - `precision`: 'float32', 'bfloat16', 'float16' (on a GPU only), or 'auto': bfloat16 where the network was trained
+      in it and the machine computes it in hardware. The last layer and all filters are in float32 in any case.
+    - `bayer`: the colour filters of a colour event camera, by their first two rows: 'rggb' (DAVIS346 colour; e2calib's
+      `--color`), 'bggr', 'grbg' or 'gbrg'. Images are then (H, W, 3), BGR; see `reconstruction.colour`.
 
     Raises CalibrationError on options out of range and on events outside the sensor.
     """
@@ -66,6 +70,7 @@ class Reconstructor:
         no_recurrent: bool = False,
         device: str | torch.device | None = None,
         precision: str = "auto",
+        bayer: str | None = None,
     ):
         if width < 1 or height < 1:
             raise CalibrationError(f"Reconstructor: sensor size is {width}x{height}; expected positive numbers.")
@@ -73,40 +78,57 @@ class Reconstructor:
             raise CalibrationError(f"Reconstructor: Imax ({Imax}) must be above Imin ({Imin}).")
         if unsharp_mask_amount < 0 or unsharp_mask_sigma <= 0 or bilateral_filter_sigma < 0:
             raise CalibrationError("Reconstructor: filter amounts must not be negative and the mask's sigma positive.")
-        self.device = torch.device("cpu" if device is None else device)
+        self.device = find_device(device)
         self.network = network.to(self.device).eval()
         self.width, self.height = int(width), int(height)
         self.unsharp_mask_amount = unsharp_mask_amount
         self.bilateral_filter_sigma = bilateral_filter_sigma
         self.flip, self.no_normalize, self.no_recurrent = flip, no_normalize, no_recurrent
-        self.padding = _padding(self.width, self.height, network.multiple)
-        self._tone_curve = ToneCurve(Imin, Imax, auto_hdr, auto_hdr_median_filter_size)
+        if bayer is not None and auto_hdr:
+            logger.warning("auto_hdr is left out: it would scale each colour by itself")
+        self._tone_curve = ToneCurve(Imin, Imax, auto_hdr and bayer is None, auto_hdr_median_filter_size)
         self._kernel = unsharp_kernel(unsharp_mask_sigma).to(self.device)
         self._working_cells = _working_cells(hot_pixels, self.width, self.height)
-        self._autocast = _uses_bfloat16(network, self.device, precision)
+        dtype = reduced_precision(network, self.device, precision)
+        self._plane = Plane(self.network, self.width, self.height, self.device, dtype, no_recurrent)
+        self._colours: dict[str, tuple[Plane, int, int]] = {}
+        if bayer is not None:
+            for colour, (row, column) in bayer_places(bayer, self.width, self.height).items():
+                size = (self.width // 2, self.height // 2)
+                plane = Plane(self.network, *size, self.device, dtype, no_recurrent)
+                self._colours[colour] = (plane, row, column)
         self.reset()
 
     def reset(self) -> None:
         """Forget everything seen so far: the next window starts a new recording."""
-        self._state: State | None = None
+        for plane in (self._plane, *(plane for plane, _, _ in self._colours.values())):
+            plane.state = None
         self._last_image: np.ndarray | None = None
         self._last_us: float | None = None
         self._tone_curve.reset()
 
     def __call__(
         self, x: np.ndarray, y: np.ndarray, t_us: np.ndarray, p: np.ndarray
-    ) -> UInt8[np.ndarray, "{self.height} {self.width}"]:
-        """The image at the end of a window of events, uint8 (H, W); arguments as for `voxel_grid`.
+    ) -> UInt8[np.ndarray, "{self.height} {self.width} *channels"]:
+        """The image at the end of a window of events, uint8 (H, W), in colour (H, W, 3); arguments as for `voxel_grid`.
 
         A window without events says that nothing changed: the last image is given again (grey before the first), and
         the state stays as it is.
         """
         if len(t_us) == 0:
-            grey = np.full((self.height, self.width), 127, dtype=np.uint8)
+            channels = (3,) if self._colours else ()
+            grey = np.full((self.height, self.width, *channels), 127, dtype=np.uint8)
             return grey if self._last_image is None else self._last_image.copy()
         self._notice_jump(float(np.min(t_us)), float(np.max(t_us)))
         with torch.inference_mode():
-            image = self._tone(self._predict(self._voxels(x, y, t_us, p)))
+            voxels = self._voxels(x, y, t_us, p)
+            image = self._tone(self._plane, voxels)
+            if self._colours:
+                planes = {
+                    colour: (self._tone(plane, voxels[:, row::2, column::2]), row, column)
+                    for colour, (plane, row, column) in self._colours.items()
+                }
+                image = merged(image, planes)
         if self.bilateral_filter_sigma > 0:
             image = _bilateral(image, self.bilateral_filter_sigma)
         self._last_image = image
@@ -121,35 +143,67 @@ class Reconstructor:
     def _voxels(
         self, x: np.ndarray, y: np.ndarray, t_us: np.ndarray, p: np.ndarray
     ) -> Float[torch.Tensor, "bins {self.height} {self.width}"]:
-        grid = accumulate(x, y, t_us, p, width=self.width, height=self.height, num_bins=self.network.num_bins)
+        size: dict[str, int] = {"width": self.width, "height": self.height, "num_bins": self.network.num_bins}
+        raw = self.no_normalize or not self.network.normalises
+        if self.device.type == "cuda":
+            return self._voxels_on_gpu(voxel_torch.accumulate(x, y, t_us, p, **size, device=self.device), raw)
+        grid = accumulate(x, y, t_us, p, **size)
         if self._working_cells is not None:
             grid = grid * self._working_cells
         if self.flip:
             grid = grid[:, ::-1, ::-1]
-        raw = self.no_normalize or not self.network.normalises
         grid = np.ascontiguousarray(grid) if raw else normalise(grid)
         return torch.from_numpy(grid).to(self.device)
 
-    def _predict(self, voxels: torch.Tensor) -> Float[torch.Tensor, "1 1 padded_height padded_width"]:
-        padded = _pad(voxels[None], self.padding, self.network.padding)
-        if self._autocast:
-            padded = padded.contiguous(memory_format=torch.channels_last)
-        precision: AbstractContextManager = (
-            torch.autocast(self.device.type, torch.bfloat16) if self._autocast else nullcontext()
-        )
-        with precision:
-            image, state = self.network(padded, self._state)
-        self._state = None if self.no_recurrent else state
-        return image.float()
+    def _voxels_on_gpu(self, grid: torch.Tensor, raw: bool) -> torch.Tensor:
+        if self._working_cells is not None:
+            grid = grid * torch.from_numpy(self._working_cells).to(self.device)
+        if self.flip:
+            grid = grid.flip(1, 2)
+        return grid if raw else voxel_torch.normalise(grid)
 
-    def _tone(self, image: Float[torch.Tensor, "1 1 padded_height padded_width"]) -> UInt8[np.ndarray, "height width"]:
-        """Sharpened, scaled to 8 bits (cut off, not rounded, as the reference does) and freed of the padding."""
+    def _tone(self, plane: "Plane", voxels: torch.Tensor) -> UInt8[np.ndarray, "height width"]:
+        """Reconstructed, sharpened, scaled to 8 bits (cut off, not rounded, as the reference does), without padding."""
+        image = plane(voxels)
         if self.unsharp_mask_amount > 0:
             blurred = F.conv2d(image, self._kernel, padding=self._kernel.shape[-1] // 2)
             image = (1 + self.unsharp_mask_amount) * image - self.unsharp_mask_amount * blurred
-        grey = self._tone_curve(image)
+        return plane.cropped(self._tone_curve(image))
+
+
+class Plane:
+    """The network at work on one image plane, whose `state` carries over from window to window."""
+
+    def __init__(
+        self,
+        network: ReconstructionNetwork,
+        width: int,
+        height: int,
+        device: torch.device,
+        dtype: torch.dtype | None,
+        forgets: bool,
+    ):
+        self.network, self.width, self.height = network, width, height
+        self.padding = _padding(width, height, network.multiple)
+        self.device_type, self.dtype, self.forgets = device.type, dtype, forgets
+        self.state: State | None = None
+
+    def __call__(self, voxels: torch.Tensor) -> Float[torch.Tensor, "1 1 padded_height padded_width"]:
+        """The image, with its padding, in float32."""
+        padded = _pad(voxels[None], self.padding, self.network.padding)
+        precision: AbstractContextManager = nullcontext()
+        if self.dtype is not None:
+            padded = padded.contiguous(memory_format=torch.channels_last)
+            precision = torch.autocast(self.device_type, self.dtype)
+        with precision:
+            image, state = self.network(padded, self.state)
+        self.state = None if self.forgets else state
+        return image.float()
+
+    def cropped(self, image: torch.Tensor) -> np.ndarray:
+        """The image (1, 1, padded height, padded width) without its padding, as an array (height, width)."""
         left, _, top, _ = self.padding
-        return grey[0, 0, top : top + self.height, left : left + self.width].cpu().numpy().copy()
+        return image[0, 0, top : top + self.height, left : left + self.width].cpu().numpy().copy()
 
 
 class ToneCurve:
@@ -230,13 +284,45 @@ def _working_cells(hot_pixels: HotPixels | None, width: int, height: int) -> np.
     return cells
 
 
-def _uses_bfloat16(network: ReconstructionNetwork, device: torch.device, precision: str) -> bool:
-    if precision not in ("auto", "float32", "bfloat16"):
-        raise CalibrationError(f"Reconstructor: precision is {precision!r}; expected auto, float32 or bfloat16.")
-    if precision != "auto":
-        return precision == "bfloat16"
-    if not network.reduced_precision:
-        return False
-    if device.type == "cpu":
-        return bool(torch.cpu.get_capabilities().get("amx_bf16", False))
-    return device.type == "cuda" and torch.cuda.is_bf16_supported()
+def find_device(device: str | torch.device | None) -> torch.device:
+    """The device of that name; None is the CPU, 'auto' a GPU where there is one, else the CPU.
+
+    Raises CalibrationError when torch does not know it, or the machine does not have it.
+    """
+    if device is None:
+        return torch.device("cpu")
+    if device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        found = torch.device(device)
+        torch.zeros(1, device=found)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise CalibrationError(
+            f"Reconstructor: device {str(device)!r} cannot be used ({str(error).splitlines()[0]}). Leave it out to "
+            "compute on the CPU."
+        ) from error
+    return found
+
+
+def reduced_precision(network: ReconstructionNetwork, device: torch.device, precision: str) -> torch.dtype | None:
+    """The type to compute in where it is not float32. float16 on a CPU is an error: bfloat16 is as quick there."""
+    if precision not in ("auto", "float32", "bfloat16", "float16"):
+        raise CalibrationError(
+            f"Reconstructor: precision is {precision!r}; expected auto, float32, bfloat16 or float16."
+        )
+    if precision == "float16":
+        if device.type == "cpu":
+            raise CalibrationError(
+                "Reconstructor: float16 is for GPUs; CPUs compute it slowly or not at all. Use bfloat16 or float32, or "
+                "a device such as cuda."
+            )
+        return torch.float16
+    if precision == "auto":
+        if not network.reduced_precision:
+            return None
+        if device.type == "cpu":
+            quick = bool(torch.cpu.get_capabilities().get("amx_bf16", False))
+        else:
+            quick = device.type == "cuda" and torch.cuda.is_bf16_supported()
+        return torch.bfloat16 if quick else None
+    return torch.bfloat16 if precision == "bfloat16" else None

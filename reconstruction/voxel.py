@@ -43,22 +43,14 @@ def accumulate(
     num_bins: int = 5,
 ) -> Float[np.ndarray, "bins height width"]:
     """As `voxel_grid`, before normalisation: the sum over all cells is the number of rises minus that of falls."""
-    if num_bins < 1:
-        raise CalibrationError(f"Voxel grid: num_bins is {num_bins}; at least one time bin is needed.")
-    columns, rows, times, polarity = (np.asarray(values) for values in (x, y, t_us, p))
-    _check(columns, rows, times, polarity, width, height)
+    columns, rows, times, polarity = check_events(x, y, t_us, p, width, height, num_bins)
     grid = np.zeros(num_bins * height * width, dtype=np.float32)
     if len(times):
         # Subtracted before the change of type: microseconds since 1970 need all bits of an integer.
         since_first = (times - times.min()).astype(np.float64)
-        position = (num_bins - 1) * since_first / (since_first.max() or 1.0)
-        lower_bin = np.minimum(position.astype(np.int64), max(num_bins - 2, 0))
-        weight_above = position - lower_bin
-        cell = (lower_bin * height + rows.astype(np.int64)) * width + columns.astype(np.int64)
-        signs = np.where(polarity > 0, 1.0, -1.0)
-        _add_each(grid, cell, signs * (1.0 - weight_above))
-        if num_bins > 1:
-            _add_each(grid, cell + height * width, signs * weight_above)
+        span = since_first.max() or 1.0
+        x32, y32 = columns.astype(np.int32), rows.astype(np.int32)
+        _add_events(grid, x32, y32, since_first, polarity > 0, span, num_bins, height, width)
     return grid.reshape(num_bins, height, width)
 
 
@@ -67,38 +59,67 @@ def normalise(grid: Float[np.ndarray, "bins height width"]) -> Float[np.ndarray,
 
     A grid whose non-zero cells are all equal has no deviation to divide by and is returned as it is, as e2calib does.
     """
-    scaled = grid.astype(np.float32)
-    filled = grid != 0
-    values = grid[filled].astype(np.float64)
-    if len(values):
-        deviation = values.std()
-        if deviation > 0:
-            scaled[filled] = (values - values.mean()) / deviation
+    scaled = np.array(grid, dtype=np.float32, order="C")
+    _scale_filled(scaled.reshape(-1))
     return scaled
 
 
-def _check(
-    columns: np.ndarray, rows: np.ndarray, times: np.ndarray, polarity: np.ndarray, width: int, height: int
-) -> None:
+def check_events(
+    x: np.ndarray, y: np.ndarray, t_us: np.ndarray, p: np.ndarray, width: int, height: int, num_bins: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The events as arrays; raises CalibrationError when they differ in length, or one lies outside the sensor."""
+    if num_bins < 1:
+        raise CalibrationError(f"Voxel grid: num_bins is {num_bins}; at least one time bin is needed.")
+    columns, rows, times, polarity = (np.asarray(values) for values in (x, y, t_us, p))
     n = len(times)
     if not len(columns) == len(rows) == len(polarity) == n:
         raise CalibrationError(
             f"Voxel grid: x, y, t_us, p have {len(columns)}, {len(rows)}, {n}, {len(polarity)} entries; "
             "there must be one of each per event."
         )
-    outside = (columns < 0) | (columns >= width) | (rows < 0) | (rows >= height)
-    if outside.any():
+    # By extremes first, which is quicker than by each.
+    if n and not (columns.min() >= 0 and columns.max() < width and rows.min() >= 0 and rows.max() < height):
+        outside = (columns < 0) | (columns >= width) | (rows < 0) | (rows >= height)
         place = int(np.argmax(outside))
         raise CalibrationError(
             f"Voxel grid: event {place} at (x, y) = ({columns[place]}, {rows[place]}) lies outside the "
             f"{width}x{height} sensor. Check the width and height given for this camera."
         )
+    return columns, rows, times, polarity
 
 
 @numba.njit(cache=True)
 @no_type_check  # the tests' runtime checks would wrap it in what numba cannot compile
-def _add_each(grid, cells, values):
-    # The reference sums in double precision but stores float32 after every event, and what that leaves where events
-    # cancel counts as non-zero in the normalisation. To agree with it, so does this; hence a loop and not a bincount.
-    for i in range(len(cells)):
-        grid[cells[i]] = np.float32(np.float64(grid[cells[i]]) + values[i])
+def _add_events(grid, x, y, since_first, rising, span, num_bins, height, width):
+    # The reference sums in double precision but stores float32 after every event, first all shares of the bins below,
+    # then all of those above; what that leaves where events cancel counts as non-zero in the normalisation. To agree
+    # with it, so does this; hence a loop and not a bincount.
+    last_lower = max(num_bins - 2, 0)
+    for above in range(2 if num_bins > 1 else 1):
+        for i in range(len(since_first)):
+            position = (num_bins - 1) * since_first[i] / span
+            lower = min(int(position), last_lower)
+            share = position - lower if above else 1.0 - (position - lower)
+            cell = ((lower + above) * height + y[i]) * width + x[i]
+            grid[cell] = np.float32(np.float64(grid[cell]) + (share if rising[i] else -share))
+
+
+@numba.njit(cache=True)
+@no_type_check
+def _scale_filled(grid):
+    count, total = 0, 0.0
+    for value in grid:
+        if value != 0:
+            count += 1
+            total += value
+    if count == 0:
+        return
+    mean, squares = total / count, 0.0
+    for value in grid:
+        if value != 0:
+            squares += (value - mean) ** 2
+    deviation = np.sqrt(squares / count)
+    if deviation > 0:
+        for i in range(len(grid)):
+            if grid[i] != 0:
+                grid[i] = np.float32((np.float64(grid[i]) - mean) / deviation)

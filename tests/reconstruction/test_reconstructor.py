@@ -2,6 +2,7 @@
 
 import logging
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -11,8 +12,10 @@ from hypothesis import strategies as st
 import reconstruction
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import Events
+from reconstruction.colour import bayer_places, merged
 from reconstruction.networks import E2VIDRecurrent, FireNet, FoldedFireNet, ReconstructionNetwork
 from reconstruction.reconstructor import unsharp_kernel
+from reconstruction.voxel import accumulate
 
 Window = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 NOTHING: Window = tuple(np.zeros(0, dtype=np.int64) for _ in range(4))  # pyright: ignore[reportAssignmentType]
@@ -263,3 +266,67 @@ def test_stream_refuses_windows_out_of_order_and_late_events():
         list(reconstruction.reconstruct([(10**9, events), (10**9, events)], make_network(), width=32, height=24))
     with pytest.raises(CalibrationError, match="ends at 5 ns holds an event"):
         list(reconstruction.reconstruct([(5, events)], make_network(), width=32, height=24))
+
+
+# --- colour, devices ---
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.sampled_from(["rggb", "bggr", "grbg", "gbrg"]), st.integers(0, 1000))
+def test_the_colour_image_has_the_brightness_of_the_grey_one(pattern: str, seed: int):
+    width, height = 24, 16
+    windows = [make_window(width, height, seed + index, 20_000 * index, 400) for index in range(2)]
+    options = {"unsharp_mask_amount": 0.0, "no_normalize": True, "precision": "float32"}
+    whole = reconstruction.Reconstructor(make_network(), width, height, bayer=pattern, **options)
+    grey = reconstruction.Reconstructor(make_network(), width, height, **options)
+    places = bayer_places(pattern, width, height)
+    assert sorted(places) == ["b", "g", "r", "w"]
+    assert [pattern[2 * row + column] for row, column in (places["r"], places["b"])] == ["r", "b"]
+    for window in windows:
+        image, lightness = whole(*window), grey(*window)
+        assert image.shape == (height, width, 3)
+        back = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        inside = (image > 0).all(axis=2) & (image < 255).all(axis=2)  # colours out of gamut lose some brightness
+        assert np.abs(back.astype(int) - lightness)[inside].max(initial=0) <= 3
+
+
+def test_colours_lie_where_their_pixels_are():
+    """A ramp over the image, sampled by each colour at its own pixels, comes back as the same ramp: no shift."""
+    ramp = np.add.outer(2.0 * np.arange(32), 3.0 * np.arange(40)).astype(np.uint8)
+    for pattern in ("rggb", "gbrg"):
+        places = bayer_places(pattern, 40, 32)
+        planes = {name: (ramp[row::2, column::2], row, column) for name, (row, column) in places.items()}
+        image = merged(ramp, planes)
+        assert np.abs(image[2:-2, 2:-2].astype(int) - ramp[2:-2, 2:-2, None]).max() <= 3
+
+
+def test_colour_needs_whole_blocks_and_a_known_pattern(caplog: pytest.LogCaptureFixture):
+    with pytest.raises(CalibrationError, match="no whole Bayer blocks"):
+        reconstruction.Reconstructor(make_network(), 31, 24, bayer="rggb")
+    with pytest.raises(CalibrationError, match="bayer is 'rgb'"):
+        reconstruction.Reconstructor(make_network(), 32, 24, bayer="rgb")
+    colour = reconstruction.Reconstructor(make_network(), 32, 24, bayer="rggb", auto_hdr=True)
+    assert "auto_hdr is left out" in caplog.text
+    assert colour(*NOTHING).shape == (24, 32, 3)
+
+
+def test_devices_that_are_not_there_are_named():
+    with pytest.raises(CalibrationError, match="device 'cuda:99' cannot be used"):
+        reconstruction.Reconstructor(make_network(), 32, 24, device="cuda:99")
+    with pytest.raises(CalibrationError, match="device 'abacus' cannot be used"):
+        reconstruction.Reconstructor(make_network(), 32, 24, device="abacus")
+    with pytest.raises(CalibrationError, match="float16 is for GPUs"):
+        reconstruction.Reconstructor(make_network(), 32, 24, precision="float16", device="cpu")
+    assert reconstruction.Reconstructor(make_network(), 32, 24, device="auto").device.type in ("cpu", "cuda")
+
+
+def test_networks_trained_on_raw_grids_get_them_padded_with_zeros():
+    window = make_window(30, 21, 1)
+    network = FireNet(base_num_channels=4, normalise=False, padding="zeros").eval()
+    seen = []
+    network.register_forward_pre_hook(lambda _, arguments: seen.append(arguments[0].clone()))
+    reconstruction.Reconstructor(network, 30, 21)(*window)
+    grid = accumulate(*window, width=30, height=21)
+    assert seen[0].shape == (1, 5, 32, 32)
+    np.testing.assert_array_equal(seen[0][0, :, 6:27, 1:31], grid)
+    assert float(seen[0].abs().sum()) == pytest.approx(np.abs(grid).sum(), rel=1e-6)

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxcal.errors import CalibrationError
-from reconstruction import voxel_grid
+from reconstruction import voxel_grid, voxel_torch
 from reconstruction.voxel import accumulate, normalise
 
 WIDTH, HEIGHT = 7, 5
@@ -140,3 +141,15 @@ def test_event_outside_the_sensor_is_refused(x: int, y: int):
 def test_arrays_of_different_lengths_are_refused():
     with pytest.raises(CalibrationError, match="2, 2, 2, 1 entries"):
         voxel_grid(np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(1), **SIZE)
+
+
+@settings(deadline=None, max_examples=60)
+@given(events(), st.integers(1, 6), st.integers(0, 2**32 - 1))
+def test_scatter_add_gives_the_same_grid_in_any_order(window: tuple[np.ndarray, ...], bins: int, seed: int):
+    """The path for GPUs, run on the CPU: exact sums, so that the order leaves no trace."""
+    size = {**SIZE, "num_bins": bins, "device": "cpu"}
+    grid = voxel_torch.accumulate(*window, **size)
+    np.testing.assert_allclose(grid, accumulate(*window, **SIZE, num_bins=bins), atol=2e-6)
+    order = np.random.default_rng(seed).permutation(len(window[0]))
+    assert torch.equal(voxel_torch.accumulate(*(values[order] for values in window), **size), grid)
+    np.testing.assert_allclose(voxel_torch.normalise(grid), normalise(grid.numpy()), atol=1e-5)
