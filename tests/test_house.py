@@ -63,6 +63,8 @@ ALLOWED: dict[str, set[str]] = {
     # The command may use every room.
     "jaxcal.cli": {"jaxcal", "reconstruction"},
     "reconstruction": OBSERVATIONS,
+    # The same command as `jaxcal reconstruct`, by another door.
+    "reconstruction.__main__": {"jaxcal.cli"},
     "reconstruction.training": {"jaxcal.simulation.event_sensor", "reconstruction"} | OBSERVATIONS,
 }
 

@@ -11,6 +11,7 @@ from jaxcal.cli.convert import convert
 from jaxcal.cli.convert_calibration import convert_calibration
 from jaxcal.cli.imu_noise import imu_noise
 from jaxcal.cli.info import info
+from jaxcal.cli.reconstruct import reconstruct
 from jaxcal.cli.report import report
 from jaxcal.cli.target import target
 from jaxcal.errors import CalibrationError
@@ -33,6 +34,10 @@ Learn an IMU's noise from a recording of it lying still:
 See what an event recording or a bag holds, and bring it into another format:
     jaxcal info recording.raw
     jaxcal convert events recording.raw events.h5
+
+\b
+Make frames from events, in which boards are found as in any camera's:
+    jaxcal reconstruct recording.raw --output frames/
 
 \b
 Use another lens model afterwards, and see what that costs:
@@ -72,4 +77,5 @@ main.add_command(imu_noise)
 main.add_command(calibrate)
 main.add_command(calibrate_cameras)
 main.add_command(compare)
+main.add_command(reconstruct)
 main.add_command(report)
