@@ -11,6 +11,7 @@ import pytest
 import torch
 from click.testing import CliRunner, Result
 
+import reconstruction
 from jaxcal.cli import main
 from jaxcal.recording import load_frames
 from reconstruction.checkpoints import save_network
