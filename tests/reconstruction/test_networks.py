@@ -8,6 +8,7 @@ import torch
 
 from jaxcal.errors import CalibrationError
 from reconstruction.networks import E2VIDRecurrent, FireNet, FoldedFireNet, ReconstructionNetwork
+from reconstruction.networks.blocks import ConvGRU
 
 SMALL = {"base_num_channels": 8, "num_encoders": 2, "num_residual_blocks": 1}
 E2VID_SWITCHES = [
@@ -56,6 +57,25 @@ def test_settings_rebuild_the_same_network(network: ReconstructionNetwork):
     twin.eval()
     voxels = torch.randn(1, network.num_bins, 32, 32)
     assert torch.equal(network(voxels, None)[0], twin(voxels, None)[0])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("kernel_size", [3, 5])
+def test_the_gru_is_the_same_with_and_without_gradients(kernel_size: int, dtype: torch.dtype):
+    torch.manual_seed(0)
+    cell = ConvGRU(4, kernel_size)
+    inputs = torch.randn(3, 2, 4, 9, 11)
+    slow = quick = None
+    with torch.autocast("cpu", dtype, enabled=dtype != torch.float32):
+        for x in inputs:
+            x = x.to(dtype)
+            _, slow = cell(x, slow)
+            with torch.no_grad():
+                before = None if quick is None else quick.clone()
+                given = quick
+                _, quick = cell(x, quick)
+                assert before is None or torch.equal(given, before)  # the state that came in is not written to
+            torch.testing.assert_close(quick, slow.detach(), atol=1e-6 if dtype == torch.float32 else 2e-2, rtol=0)
 
 
 def test_official_defaults_have_the_published_sizes():
