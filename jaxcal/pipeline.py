@@ -69,6 +69,27 @@ def run_pipeline(
     output.mkdir(parents=True, exist_ok=True)
     cache = settings.cache or _cache_folder(rig.path.resolve().parent, output)
     imus = [imu.load() for imu in rig.imus]
+    detections, images = detect_rig(rig, cache, settings=settings, workers=workers, progress=progress)
+    calibration = _calibrated(rig, detections, imus, options, progress)
+    calibration.save(output)
+    if settings.report:
+        write_report(calibration, output / "report.html", images=images, progress=progress)
+    return calibration
+
+
+def detect_rig(
+    rig: Rig,
+    cache: Path,
+    *,
+    settings: PipelineSettings | None = None,
+    workers: int | None = None,
+    progress: Progress = no_progress,
+) -> tuple[list[Detections], dict[str, Frames]]:
+    """The corners that each camera of a rig saw, and the images of the cameras that have any, by name.
+
+    Frames and detections are cached in the folder `cache`. Raises CalibrationError as `run_pipeline`.
+    """
+    settings = settings or PipelineSettings()
     corners = {c.name: c.load_detections(rig.target) for c in rig.cameras if c.detections is not None}
     images, span_ns = _images(rig, corners, settings, cache, progress)
     detections = [
@@ -77,11 +98,7 @@ def run_pipeline(
         else detect(images[name], rig.target, workers=workers, cache=cache, progress=progress, name=name)
         for name in (camera.name for camera in rig.cameras)
     ]
-    calibration = _calibrated(rig, detections, imus, options, progress)
-    calibration.save(output)
-    if settings.report:
-        write_report(calibration, output / "report.html", images=images, progress=progress)
-    return calibration
+    return detections, images
 
 
 def _options(rig: Rig, settings: PipelineSettings) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """`jaxcal calibrate`: a rig.yaml in, a calibration and its report out."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -19,10 +20,17 @@ from jaxcal.cli.outcome import EXIT_CODES
 )
 @click.option("--window-ms", type=float, help="Length of an event window, where RIG.yaml does not say (33).")
 @click.option("--workers", type=int, help="Processes for detection (one per core).")
+@click.option("--report/--no-report", default=True, help="Write report.html, too (some seconds).  [default: report]")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 @click.pass_context
 def calibrate(
-    ctx: click.Context, rig: Path, output: Path, window_ms: float | None, workers: int | None, as_json: bool
+    ctx: click.Context,
+    rig: Path,
+    output: Path,
+    window_ms: float | None,
+    workers: int | None,
+    report: bool,
+    as_json: bool,
 ) -> None:
     """Calibrate the cameras, event cameras and IMUs that a rig.yaml names, jointly.
 
@@ -67,7 +75,9 @@ def calibrate(
     from jaxcal.cli.progress_bars import ProgressBars
     from jaxcal.pipeline import PipelineSettings, run_pipeline
 
-    settings = PipelineSettings() if window_ms is None else PipelineSettings(window_ms=window_ms)
+    settings = PipelineSettings(report=report)
+    if window_ms is not None:
+        settings = replace(settings, window_ms=window_ms)
     with ProgressBars() as bars:
         calibration = run_pipeline(rig, output, settings=settings, workers=workers, progress=bars)
     truth = rig.parent / "ground_truth.yaml"

@@ -1,39 +1,46 @@
-"""`jaxcal calibrate-cameras`: images or corner tables in, a calibration and its report out."""
+"""`jaxcal calibrate-cameras`: images, a bag or corner tables in, a calibration and its report out."""
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from jaxcal.cli.kalibr_arguments import SHARED_NOT_NEEDED, VERBOSE, KalibrCommand, Many, all_of, not_needed
+from jaxcal.cli.outcome import EXIT_CODES
+from jaxcal.cli.sizes import Size
+
 if TYPE_CHECKING:
-    from jaxcal.estimation import Loss
-    from jaxcal.observations import Detections, Frames
-    from jaxcal.progress import Progress
-    from jaxcal.targets import Target
+    from jaxcal.recording import Rig, RigCamera
 
-# Images that carry no time are taken this far apart.
-_STEP_NS = 100_000_000
+# Kalibr's tolerance for frames of one moment, where cameras are given its way; s.
+_KALIBR_SYNC_S = 0.02
 
-
-class _Size(click.ParamType):
-    """An image size such as 752x480."""
-
-    name = "WIDTHxHEIGHT"
-
-    def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        match = re.fullmatch(r"(\d+)x(\d+)", value)
-        if match is None:
-            self.fail(f"'{value}' is no size such as 752x480", param, ctx)
-        return int(match[1]), int(match[2])
+_NOT_NEEDED = all_of(
+    SHARED_NOT_NEEDED,
+    not_needed("--qr-tol", "no view is judged by a rank; what the views leave open is said in words.", float),
+    not_needed("--mi-tol", "all views are used, which is quick here; --views N keeps the N that tell most.", float),
+    not_needed("--no-shuffle", "all views are solved at once: there is no order to shuffle."),
+    not_needed("--no-outliers-removal", "corners that disagree are always left out; the report counts them."),
+    not_needed("--no-final-filtering", "outliers are found with all views in the solution, not view by view."),
+    not_needed("--min-views-outlier", "outliers are found with all views in the solution, not view by view.", int),
+    not_needed("--plot-outliers", "the report draws the corners that were left out."),
+    not_needed("--plot", "the report draws everything when it is finished."),
+)
 
 
-@click.command("calibrate-cameras")
-@click.argument("sources", nargs=-1, required=True, metavar="CAMERA...")
+@click.command("calibrate-cameras", cls=KalibrCommand, epilog=EXIT_CODES)
+@click.argument("sources", nargs=-1, metavar="[CAMERA...]")
 @click.option(
     "--target", "target_file", required=True, type=click.Path(dir_okay=False, path_type=Path), help="target.yaml"
 )
-@click.option("--models", multiple=True, help="Lens model; once for all cameras, or once per camera (pinhole-radtan).")
+@click.option("--models", cls=Many, help="Lens models; one for all cameras, or one each (pinhole-radtan).")
+@click.option("--bag", type=click.Path(path_type=Path), help="Bag, or EuRoC folder, that holds all cameras.")
+@click.option("--topics", cls=Many, help="With --bag: the topic of each camera.")
+@click.option("--bag-from-to", nargs=2, type=float, metavar="START END", help="Use this part only; s after the start.")
+@click.option("--bag-freq", type=float, help="Use at most so many images a second.")
+@click.option("--approx-sync", type=float, help="Frames this close are one view; s (with --bag: 0.02).")
+@click.option("--sync-tolerance", type=float, help="Frames this close are one view; ms (without --bag: 2).")
 @click.option("--views", type=int, help="Use only so many views, those that tell most.")
 @click.option("--board-warp", is_flag=True, help="Estimate how the board is bent.")
 @click.option("--point-offsets", type=float, help="Let each point of the board be off its place by about so much; mm.")
@@ -44,33 +51,25 @@ class _Size(click.ParamType):
     "--rolling-shutter", is_flag=True, help="Rows are seen one after another: estimate the delay (moving pictures)."
 )
 @click.option("--loss", default="huber", show_default=True, help="Robust loss under which outliers are found.")
-@click.option("--resolution", type=_Size(), help="Image size of corner tables that do not hold it.")
-@click.option(
-    "--sync-tolerance", type=float, default=2.0, show_default=True, help="Frames this close are one view; ms."
-)
+@click.option("--use-blakezisserman", is_flag=True, help="Kalibr's harder loss: as --loss geman-mcclure.")
+@click.option("--resolution", type=Size(), help="Image size of corner tables that do not hold it.")
+@click.option("--export-poses", is_flag=True, help="Write where the camera stood in each view, as a csv.")
 @click.option("--workers", type=int, help="Processes for detection (one per core).")
-@click.option("--out", required=True, type=click.Path(file_okay=False, path_type=Path), help="Folder for the results.")
-def calibrate_cameras(
-    sources: tuple[str, ...],
-    target_file: Path,
-    models: tuple[str, ...],
-    views: int | None,
-    board_warp: bool,
-    point_offsets: float | None,
-    time_offsets: bool,
-    rolling_shutter: bool,
-    loss: str,
-    resolution: tuple[int, int] | None,
-    sync_tolerance: float,
-    workers: int | None,
-    out: Path,
-) -> None:
+@click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), help="Folder for the results (with --bag: BAG-jaxcal)."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+@VERBOSE
+@_NOT_NEEDED
+@click.pass_context
+def calibrate_cameras(ctx: click.Context, sources: tuple[str, ...], out: Path | None, **given: Any) -> None:
     """Calibrate cameras from what each of them saw of a board.
 
     \b
     A CAMERA is one of
         a folder of images        EuRoC/ASL (data.csv and data/), or <time in ns>.png
         a pattern of file names   'left*.jpg', quoted; the number in each name stands for its time
+        a topic of a bag          drive.bag:/cam0/image_raw
         corners.npz               what jaxcal detected, or a corner table: corners.npz:cam0 takes its columns cam0_*
 
     \b
@@ -78,96 +77,108 @@ def calibrate_cameras(
     jaxcal calibrate-cameras 'calib/left*.jpg' 'calib/right*.jpg' --target board.yaml --out result
     jaxcal calibrate-cameras corners.npz:cam0 --resolution 752x480 --target board.yaml --views 50 --out result
 
-    The folder gets camchain.yaml (Kalibr's format), report.html and everything needed to look closer; detections are
-    kept there, so that a second run is quick.
+    \b
+    Kalibr's own command works with the program's name changed; bags may be of ROS 1, ROS 2 or mcap:
+    jaxcal calibrate-cameras --target april.yaml --models pinhole-radtan omni-radtan \\
+        --bag cams.bag --topics /cam0/image_raw /cam1/image_raw --bag-from-to 5 60 --dont-show-report
+
+    The folder gets camchain.yaml (Kalibr's format), report.html and everything needed to look closer, and, with --bag,
+    Kalibr's files by Kalibr's names (cams-camchain.yaml, cams-results-cam.txt). Detections are kept there, so that a
+    second run is quick.
     """
-    import jaxcal
+    from jaxcal.cli.kalibr_output import bag_tag, output_folder, write_kalibr_files
+    from jaxcal.cli.outcome import show_calibration
     from jaxcal.cli.progress_bars import ProgressBars
-    from jaxcal.results import results_text, write_report
+    from jaxcal.pipeline import PipelineSettings, run_pipeline
 
-    if models and len(models) not in (1, len(sources)):
-        raise click.UsageError(f"{len(models)} --models for {len(sources)} cameras; give one for all, or one each.")
-    target = jaxcal.load_target(target_file)
-    names = [f"cam{number}" for number in range(len(sources))]
-    chosen = list(models) * len(sources) if len(models) == 1 else list(models) or ["pinhole-radtan"] * len(sources)
-    for model in chosen:
-        jaxcal.camera_model(model)  # an unknown name is reported now, not after minutes of detection
+    bag, topics = given["bag"], given["topics"]
+    _check_usage(ctx, sources, out, given)
+    rig = _rig(sources, given)
+    out = out or output_folder(bag)
+    settings = PipelineSettings(cache=out / "cache", cameras=_options(given))
     with ProgressBars() as bars:
-        images, corners = {}, []
-        for name, source in zip(names, sources, strict=True):
-            frames, detections = _camera(name, source, target, resolution, workers, out, bars)
-            corners.append(detections)
-            if frames is not None:
-                images[name] = frames
-        calibration = jaxcal.calibrate_cameras(
-            corners,
-            target,
-            chosen,
-            names=names,
-            sync_tolerance_s=1e-3 * sync_tolerance,
-            views=views,
-            board_warp=board_warp,
-            point_offset_sigma_m=None if point_offsets is None else 1e-3 * point_offsets,
-            time_offsets=time_offsets,
-            rolling_shutter=rolling_shutter,
-            loss=cast("Loss", loss),
-            progress=bars,
-        )
-        calibration.save(out)
-        write_report(calibration, out / "report.html", images=images, progress=bars)
-    click.echo(results_text(calibration))
-    for warning in calibration.warnings:
-        click.echo(f"warning: {warning}")
-    click.echo(f"report: {(out / 'report.html').resolve()}")
+        calibration = run_pipeline(rig, out, settings=settings, workers=given["workers"], progress=bars)
+    files = {}
+    if bag is not None:
+        files = write_kalibr_files(calibration, out, bag_tag(bag), topics, poses=given["export_poses"])
+    elif given["export_poses"]:
+        files = write_kalibr_files(calibration, out, "all", [None] * len(rig.cameras), poses=True)
+    ctx.exit(show_calibration(calibration, out, as_json=given["as_json"], files=files))
 
 
-def _camera(
-    name: str,
-    source: str,
-    target: "Target",
-    resolution: tuple[int, int] | None,
-    workers: int | None,
-    out: Path,
-    progress: "Progress",
-) -> "tuple[Frames | None, Detections]":
-    """The corners of one camera, and its images where there are any."""
-    from jaxcal import detect
-    from jaxcal.recording import load_detections
+def _check_usage(ctx: click.Context, sources: tuple[str, ...], out: Path | None, given: dict[str, Any]) -> None:
+    bag, topics, models = given["bag"], given["topics"], given["models"]
+    if (bag is None) != (not topics):
+        raise click.UsageError("--bag and --topics belong together: name a topic for each camera.", ctx)
+    if bool(sources) == (bag is not None):
+        raise click.UsageError("name the cameras, or --bag with --topics, one way or the other.", ctx)
+    if bag is None and out is None:
+        raise click.UsageError("missing --out, a folder for the results.", ctx)
+    count = len(sources) or len(topics)
+    if models and len(models) not in (1, count):
+        raise click.UsageError(f"{len(models)} --models for {count} cameras; give one for all, or one each.", ctx)
+    if given["approx_sync"] is not None and given["sync_tolerance"] is not None:
+        raise click.UsageError("--approx-sync (s) and --sync-tolerance (ms) say the same; give one.", ctx)
+
+
+def _options(given: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of `jaxcal.calibrate_cameras`."""
+    if given["approx_sync"] is not None:
+        tolerance = given["approx_sync"]
+    elif given["sync_tolerance"] is not None:
+        tolerance = 1e-3 * given["sync_tolerance"]
+    else:
+        tolerance = 0.002 if given["bag"] is None else _KALIBR_SYNC_S
+    offsets = given["point_offsets"]
+    return {
+        "sync_tolerance_s": tolerance,
+        "views": given["views"],
+        "board_warp": given["board_warp"],
+        "point_offset_sigma_m": None if offsets is None else 1e-3 * offsets,
+        "time_offsets": given["time_offsets"],
+        "loss": "geman-mcclure" if given["use_blakezisserman"] else given["loss"],
+    }
+
+
+def _rig(sources: tuple[str, ...], given: dict[str, Any]) -> "Rig":
+    """What the arguments name, as a rig.yaml would; an unknown model is reported now, not after the files are read."""
+    from jaxcal import camera_model, load_target
+    from jaxcal.recording import Rig, RigCamera
+    from jaxcal.recording.sources import camera_source
+
+    target = load_target(given["target_file"])
+    count = len(sources) or len(given["topics"])
+    models = list(given["models"] or ["pinhole-radtan"])
+    models = models * count if len(models) == 1 else models
+    for model in models:
+        camera_model(model)
+    cameras = []
+    for number, model in enumerate(models):
+        common: dict[str, Any] = {
+            "name": f"cam{number}",
+            "model": model,
+            "rolling_shutter": given["rolling_shutter"],
+        }
+        if sources:
+            cameras.append(named_camera(sources[number], given["resolution"], common))
+        else:
+            source = camera_source(given["bag"], given["topics"][number])
+            place: dict[str, Any] = {source.kind: source.place}
+            cameras.append(RigCamera(**common, **place))
+    return Rig(
+        path=given["target_file"],
+        target=target,
+        cameras=tuple(cameras),
+        from_to=given["bag_from_to"],
+        frame_rate_hz=given["bag_freq"],
+    )
+
+
+def named_camera(source: str, resolution: tuple[int, int] | None, common: dict[str, Any]) -> "RigCamera":
+    """A camera by what the command line names: images, or a table of corners with the columns to take."""
+    from jaxcal.recording import RigCamera
 
     table = re.fullmatch(r"(.*\.npz)(?::(\w+))?", source)
-    if table is not None:
-        return None, load_detections(table[1], target, resolution, table[2] or name)
-    frames = _frames(source)
-    return frames, detect(frames, target, workers=workers, cache=out / "cache", progress=progress, name=name)
-
-
-def _frames(source: str) -> "Frames":
-    """The images of a folder, or of a pattern of file names with the number in each name for a time."""
-    import glob
-
-    import numpy as np
-
-    from jaxcal.errors import CalibrationError
-    from jaxcal.observations import Frames
-    from jaxcal.recording import ImageFiles, load_frames
-    from jaxcal.recording.images import read_grey
-
-    if not glob.has_magic(source):
-        return load_frames(source)
-    numbered: dict[int, Path] = {}
-    for path in sorted(Path(found) for found in glob.glob(source)):
-        digits = re.findall(r"\d+", path.stem)
-        if not digits:
-            raise CalibrationError(f"{path}: no number in the name; images of one moment are matched by it. Rename it.")
-        number = int(digits[-1])
-        if number in numbered:
-            raise CalibrationError(f"{path}: has the number of {numbered[number]}. Give a narrower pattern.")
-        numbered[number] = path
-    if not numbered:
-        raise CalibrationError(f"{source}: no such images. Quote the pattern, and check the folder.")
-    numbers = sorted(numbered)
-    height, width = read_grey(numbered[numbers[0]]).shape
-    paths = tuple(numbered[number] for number in numbers)
-    # Numbers that are times in nanoseconds already stay what they are.
-    step = 1 if numbers[-1] > 10**12 else _STEP_NS
-    return Frames(np.array(numbers, np.int64) * step, ImageFiles(paths, (width, height)), (width, height))
+    if table is None:
+        return RigCamera(**common, frames=Path(source))
+    return RigCamera(**common, detections=Path(table[1]), prefix=table[2] or common["name"], resolution=resolution)

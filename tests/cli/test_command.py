@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import cv2
 import numpy as np
 import pytest
@@ -34,13 +35,22 @@ def jaxcal(*arguments: str | Path) -> Result:
     return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
-@pytest.mark.parametrize("command", [[], ["target"], ["convert"], ["convert", "camera"], ["calibrate-cameras"]])
+COMMANDS = [[], ["convert", "camera"], *([name] for name in main.list_commands(click.Context(main)))]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command: list[str]) -> None:
     result = jaxcal(*command, "--help")
     assert result.exit_code == 0
     assert "Usage: " in result.output
     if command != ["convert"]:
         assert f"jaxcal {' '.join(command)}" in result.output  # an example
+
+
+def test_a_command_that_is_misspelt() -> None:
+    result = jaxcal("calibrat", "rig.yaml")
+    assert result.exit_code == 2
+    assert "No such command 'calibrat'. Did you mean 'calibrate'?" in result.stderr
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -206,7 +216,7 @@ def test_impossible_requests_fail_before_the_work(tmp_path: Path) -> None:
         (["left", "--models", "pinhole-radial"], 1, "camera model 'pinhole-radial' is unknown"),
         (["left"], 1, "left"),
         ([str(tmp_path / "left*.png")], 1, "no such images"),
-        (["corners.npz", "--resolution", "640"], 2, "'640' is no size such as 752x480"),
+        (["corners.npz", "--resolution", "640"], 2, "'640' is no size such as 640x480"),
         (["absent.npz"], 1, "absent.npz: no such detections file"),
     ):
         result = jaxcal("calibrate-cameras", *arguments, *common)
