@@ -54,13 +54,21 @@ class InertialData(eqx.Module):
 
 
 class IntervalEquations(eqx.Module):
-    """What one IMU says in each knot interval of a window of k chain blocks (rotation, position, its biases: 12
-    coordinates each) and of s shared coordinates: the IMU's own (parameters, place, time shift), and gravity."""
+    """What one IMU says in each knot interval: of a window of k poses (6 coordinates each), of its biases at the
+    interval's two ends, and of s shared coordinates: the IMU's own (parameters, place, time shift), and gravity.
 
-    window: Float[Array, "I k 12 k 12"]
-    cross: Float[Array, "I k 12 s"]
+    `bias_pose` and `bias_cross` are the biases' products with poses and shared coordinates; those of the biases with
+    each other are diagonal.
+    """
+
+    window: Float[Array, "I k 6 k 6"]
+    cross: Float[Array, "I k 6 s"]
+    gradient: Float[Array, "I k 6"]
+    bias_pose: Float[Array, "I 2 6 k 6"]
+    bias_cross: Float[Array, "I 2 6 s"]
+    bias_bias: Float[Array, "I 2 2 6"]
+    gradient_bias: Float[Array, "I 2 6"]
     shared: Float[Array, "s s"]
-    gradient_window: Float[Array, "I k 12"]
     gradient_shared: Float[Array, " s"]
     cost: Float[Array, ""]
 
@@ -76,7 +84,7 @@ class _Window(eqx.Module):
     first: Float[Array, "*I 3 3"]
     increments: Increments
     control: Float[Array, "*I k 3"]
-    bias: Float[Array, "*I k 6"]
+    bias: Float[Array, "*I 2 6"]
 
 
 def _chain_windows(state: RigState, intervals: int, order: int, imu: int) -> _Window:
@@ -85,7 +93,7 @@ def _chain_windows(state: RigState, intervals: int, order: int, imu: int) -> _Wi
         state.rotations[:intervals],
         jax.tree.map(lambda leaf: _windows(leaf, intervals, order - 1), chain),
         _windows(state.positions, intervals, order),
-        _windows(state.biases[:, 6 * imu : 6 * imu + 6], intervals, order),
+        _windows(state.biases[:, 6 * imu : 6 * imu + 6], intervals, 2),
     )
 
 
@@ -130,35 +138,33 @@ def _responses(state: RigState, layout: SharedLayout, imu: int, value: Array, st
 
 def _sample_rows(
     state: RigState, layout: SharedLayout, imu: int, data: ImuSamples, dt: Array, order: int
-) -> Callable[[Array, Array, _Window], Array]:
-    """A function from one sample (fraction, reading, window) to its Jacobian rows (6, 12 k + s + 1)."""
+) -> Callable[[Array, Array, _Window], tuple[Array, Array]]:
+    """A function from one sample (fraction, reading, window) to its Jacobian rows (6, 6 k + s + 1), residual last, and
+    the weights (2,) of the biases at the interval's ends in all six."""
     own = layout.imus[imu]
     basis = layout.gravity_basis(state.gravity)
-    no_tail = jnp.zeros(order - 2)
 
-    def plain(u: Array, reading: Array, window: _Window) -> Array:
+    def plain(u: Array, reading: Array, window: _Window) -> tuple[Array, Array]:
         """`calibrated` at the rig's origin, in closed form."""
         point = rotation_at(window.first, window.increments, u, dt, order)
         second = weights(basis_matrix(order), u, dt, 2)
-        bias_weights = jnp.concatenate([jnp.stack([1.0 - u, u]), no_tail])
+        ends = jnp.stack([1.0 - u, u])
         predicted, by_window, by_gravity = predict_with_jacobian(
-            point, second @ window.control, second, state.gravity, basis, bias_weights @ window.bias, bias_weights
+            point, second @ window.control, second, state.gravity, basis, ends @ window.bias
         )
-        return jnp.concatenate([by_window.reshape(6, -1), by_gravity, (predicted - reading)[:, None]], axis=1)
+        return jnp.concatenate([by_window.reshape(6, -1), by_gravity, (predicted - reading)[:, None]], axis=1), ends
 
-    def general(u: Array, reading: Array, window: _Window) -> Array:
+    def general(u: Array, reading: Array, window: _Window) -> tuple[Array, Array]:
         u = u + (state.imu_shift[imu] - data.shift) / dt
         motion = _motion(window, u, dt, state.gravity, order)
-        bias_weights = jnp.concatenate([jnp.stack([1.0 - u, u]), no_tail])
+        ends = jnp.stack([1.0 - u, u])
 
         def response(value: Array, step: Array) -> Array:
             return _responses(state, layout, imu, value, step)
 
         zero = jnp.zeros(own.size - own.placed)
         by_value, by_step = jax.jacrev(response, argnums=(0, 1))(motion.value, zero)
-        by_pose = jnp.einsum("ij,jkl->ikl", by_value, motion.by_window)
-        by_bias = jnp.eye(6)[:, None, :] * bias_weights[None, :, None]
-        by_window = jnp.concatenate([by_pose, by_bias], axis=2).reshape(6, -1)
+        by_window = jnp.einsum("ij,jkl->ikl", by_value, motion.by_window).reshape(6, -1)
         by_gravity = -by_value[:, 6:] @ motion.rotation.T @ basis
         columns = [by_window, by_step]
         if own.placed:
@@ -168,8 +174,8 @@ def _sample_rows(
 
             _, rate = jax.jvp(value_at, (u,), (1.0 / dt,))
             columns.append((by_value @ rate + (window.bias[1] - window.bias[0]) / dt)[:, None])
-        predicted = response(motion.value, zero) + bias_weights @ window.bias
-        return jnp.concatenate([*columns, by_gravity, (predicted - reading)[:, None]], axis=1)
+        predicted = response(motion.value, zero) + ends @ window.bias
+        return jnp.concatenate([*columns, by_gravity, (predicted - reading)[:, None]], axis=1), ends
 
     return general if own.size else plain
 
@@ -179,25 +185,33 @@ def linearise_imu(state: RigState, data: InertialData, order: int, layout: Share
     samples = data.samples[imu]
     intervals = samples.fraction.shape[0]
     rows_of = _sample_rows(state, layout, imu, samples, data.dt, order)
+    n = 6 * order
 
-    def interval(parts: tuple) -> Array:
+    def interval(parts: tuple) -> tuple[Array, Array, Array]:
         u, reading, present, window = parts
-        rows = jax.vmap(rows_of, in_axes=(0, 0, None))(u, reading, window)
-        flat = (rows * (present[:, None] * samples.inverse_sigma)[..., None]).reshape(-1, rows.shape[-1])
-        return flat.T @ flat
+        rows, ends = jax.vmap(rows_of, in_axes=(0, 0, None))(u, reading, window)
+        whiten = present[:, None] * samples.inverse_sigma  # (S, 6)
+        rows, by_bias = rows * whiten[..., None], ends[:, :, None] * whiten[:, None, :]  # (S, 6, n + s + 1), (S, 2, 6)
+        flat = rows.reshape(-1, rows.shape[-1])
+        with_bias = jnp.einsum("sei,six->eix", by_bias, rows)
+        return flat.T @ flat, with_bias, jnp.einsum("sei,sfi->efi", by_bias, by_bias)
 
     parts = (samples.fraction, samples.readings, samples.present, _chain_windows(state, intervals, order, imu))
     batches = jax.tree.map(lambda leaf: leaf.reshape(-1, INTERVAL_BATCH, *leaf.shape[1:]), parts)
-    gram = jax.lax.map(jax.vmap(interval), batches)
-    gram = gram.reshape(intervals, *gram.shape[2:])
-    n = 12 * order
+    reduced = jax.lax.map(jax.vmap(interval), batches)
+    gram, with_bias, bias_bias = (leaf.reshape(intervals, *leaf.shape[2:]) for leaf in reduced)
+    shared = gram[:, n:, n:].sum(axis=0)
     return IntervalEquations(
-        window=gram[:, :n, :n].reshape(intervals, order, 12, order, 12),
-        cross=gram[:, :n, n:-1].reshape(intervals, order, 12, -1),
-        shared=gram[:, n:-1, n:-1].sum(axis=0),
-        gradient_window=gram[:, :n, -1].reshape(intervals, order, 12),
-        gradient_shared=gram[:, n:-1, -1].sum(axis=0),
-        cost=0.5 * gram[:, -1, -1].sum(),
+        window=gram[:, :n, :n].reshape(intervals, order, 6, order, 6),
+        cross=gram[:, :n, n:-1].reshape(intervals, order, 6, -1),
+        gradient=gram[:, :n, -1].reshape(intervals, order, 6),
+        bias_pose=with_bias[..., :n].reshape(intervals, 2, 6, order, 6),
+        bias_cross=with_bias[..., n:-1],
+        bias_bias=bias_bias,
+        gradient_bias=with_bias[..., -1],
+        shared=shared[:-1, :-1],
+        gradient_shared=shared[:-1, -1],
+        cost=0.5 * shared[-1, -1],
     )
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.calibration import inertial, vision
+from jaxcal.calibration.equations import PoseEquations, of_poses, with_imus
 from jaxcal.calibration.inertial import InertialData
 from jaxcal.calibration.lens_basis import LensBasis
 from jaxcal.calibration.rolling import linearise_rolling, rolling_errors
@@ -13,7 +14,7 @@ from jaxcal.calibration.state import RigState, SharedLayout
 from jaxcal.calibration.target_shape import TargetGeometry, points_by_target, target_points
 from jaxcal.calibration.vision import FrameEquations, FramePoses, VisionData
 from jaxcal.cameras import CameraModel
-from jaxcal.estimation import BlockArrow, band_from_windows, chain_from_windows, robust_loss
+from jaxcal.estimation import BlockArrow, robust_loss
 from jaxcal.trajectory import PoseSpline
 
 
@@ -52,9 +53,11 @@ class RigProblem(eqx.Module):
 
     def linearise(self, state: RigState) -> BlockArrow:
         """Cost and normal equations at `state`."""
-        equations = self._vision(state)
-        if self.imu is not None:
-            equations = _add_imu(equations, state, self.imu, self.order, self.layout)
+        corners = self._vision(state)
+        if self.imu is None:
+            equations = of_poses(corners, self.layout)
+        else:
+            equations = with_imus(corners, state, self.imu, self.order, self.layout)
         equations = self._add_lens_prior(equations, state)
         equations = self._add_target_prior(equations, state)
         return equations.hold(self.free_chain, self.free)
@@ -116,7 +119,7 @@ class RigProblem(eqx.Module):
         """T_cam_target of every frame, per group."""
         return tuple(vision.frame_transforms(state, data, self.poses(state, data)) for data in self.corners)
 
-    def _vision(self, state: RigState) -> BlockArrow:
+    def _vision(self, state: RigState) -> PoseEquations:
         points, by_target = self.target_arrays(state)
         intervals = state.positions.shape[0] - self.order + 1
         targets = self.layout.target_size
@@ -147,15 +150,12 @@ class RigProblem(eqx.Module):
                 shared = shared.at[columns[:, None], columns].add(frames.shared[place])
                 gradient = gradient.at[columns].add(frames.gradient_shared[place])
 
-        others = self.layout.inertial
-        none = jnp.zeros((intervals, self.order, 6, others.stop - others.start))
-        columns = [*(borders[c] for c in range(self.layout.num_cameras)), none, *delays, border_target]
-        padding = [(0, 0), (0, 0), (0, self.free_chain.shape[1] - 6)]
-        return BlockArrow(
-            band=band_from_windows(jnp.pad(window, [*padding, (0, 0), padding[-1]])),
-            border=chain_from_windows(jnp.pad(jnp.concatenate(columns, axis=-1), [*padding, (0, 0)])),
+        return PoseEquations(
+            window=window,
+            cameras=jnp.concatenate([borders[c] for c in range(self.layout.num_cameras)], axis=-1),
+            others=jnp.concatenate([*delays, border_target], axis=-1),
+            gradient=gradient_window,
             corner=shared,
-            gradient_chain=chain_from_windows(jnp.pad(gradient_window, padding)),
             gradient_shared=gradient,
             cost=cost,
         )
@@ -219,29 +219,3 @@ class RigProblem(eqx.Module):
                 corner = corner.at[rows, rows].add(information[place])
                 gradient = gradient.at[rows].add(force[place])
         return eqx.tree_at(lambda e: (e.corner, e.gradient_shared, e.cost), equations, (corner, gradient, cost))
-
-
-def _add_imu(
-    equations: BlockArrow, state: RigState, data: InertialData, order: int, layout: SharedLayout
-) -> BlockArrow:
-    """The motion prior, the biases' random walk, and every IMU: its samples, and what is usual of its parameters."""
-    prior = inertial.linearise_prior(state, data)
-    width = min(3, equations.band.shape[1])
-    band = equations.band.at[:, :width].add(prior.band[:, :width])
-    border, corner = equations.border, equations.corner
-    gradient_chain, gradient_shared = equations.gradient_chain + prior.gradient, equations.gradient_shared
-    cost = equations.cost + prior.cost
-    for i in range(len(layout.imus)):
-        samples = inertial.linearise_imu(state, data, order, layout, i)
-        usual = inertial.linearise_model_prior(state, layout, i)
-        own, gravity = layout.imu(i), layout.gravity
-        shared = np.r_[own, gravity]
-        # Of a chain block, pose and this IMU's biases.
-        block = np.r_[0:6, 6 + 6 * i : 12 + 6 * i]
-        band = band.at[:, :, block[:, None], block].add(band_from_windows(samples.window))
-        border = border.at[:, block[:, None], shared].add(chain_from_windows(samples.cross))
-        corner = corner.at[shared[:, None], shared].add(samples.shared).at[own, own].add(usual.information)
-        gradient_chain = gradient_chain.at[:, block].add(chain_from_windows(samples.gradient_window))
-        gradient_shared = gradient_shared.at[shared].add(samples.gradient_shared).at[own].add(usual.gradient)
-        cost = cost + samples.cost + usual.cost
-    return BlockArrow(band, border, corner, gradient_chain, gradient_shared, cost)

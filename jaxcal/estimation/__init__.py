@@ -7,6 +7,7 @@ from jaxcal.estimation.block_arrow import (
     band_from_windows,
     chain_from_windows,
     factorise,
+    sum_along_chain,
 )
 from jaxcal.estimation.descent import BlockArrowDescent, BlockStep, damped_step
 from jaxcal.estimation.losses import LOSSES, Loss, barron, huber, robust_loss
@@ -36,4 +37,5 @@ __all__ = [
     "single_threaded_blas",
     "solve",
     "solve_inside",
+    "sum_along_chain",
 ]

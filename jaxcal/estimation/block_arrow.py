@@ -7,7 +7,7 @@ A structured Cholesky factorisation, linear in K, solves with H; its Schur compl
 matrix of the shared parameters.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -241,18 +241,23 @@ def _superblock_matrices(
 
 def band_from_windows(windows: Float[Array, "I w B w B"]) -> Float[Array, "K w B B"]:
     """Sum per-interval Hessians over the chain: interval i couples chain blocks i .. i + w - 1; K = I + w - 1."""
-    intervals, width, size = windows.shape[:3]
-    band = jnp.zeros((intervals + width - 1, width, size, size))
-    for d in range(width):
-        for a in range(width - d):
-            band = band.at[a : a + intervals, d].add(windows[:, a + d, :, a, :])
-    return band
+    intervals, width = windows.shape[:2]
+    blocks = intervals + width - 1
+    diagonals = [
+        sum_along_chain([(a, windows[:, a + d, :, a, :]) for a in range(width - d)], blocks) for d in range(width)
+    ]
+    return jnp.stack(diagonals, axis=1)
 
 
-def chain_from_windows(windows: Float[Array, "I w B *rest"]) -> Float[Array, "K B *rest"]:
-    """Sum per-interval gradients or border rows over the chain; K = I + w - 1."""
-    intervals, width, *rest = windows.shape
-    chain = jnp.zeros((intervals + width - 1, *rest))
-    for a in range(width):
-        chain = chain.at[a : a + intervals].add(windows[:, a])
-    return chain
+def chain_from_windows(windows: Float[Array, "I w B *rest"], blocks: int | None = None) -> Float[Array, "K B *rest"]:
+    """Sum per-interval gradients or border rows over the chain of K blocks, by default K = I + w - 1."""
+    intervals, width = windows.shape[:2]
+    return sum_along_chain([(a, windows[:, a]) for a in range(width)], blocks or intervals + width - 1)
+
+
+def sum_along_chain(parts: Sequence[tuple[int, Float[Array, "I *rest"]]], blocks: int) -> Float[Array, "K *rest"]:
+    """Sum of `parts`, each an offset and what it adds to the chain blocks from there on, in one pass over memory."""
+    first, *others = [
+        jnp.pad(part, [(offset, blocks - offset - len(part)), *[(0, 0)] * (part.ndim - 1)]) for offset, part in parts
+    ]
+    return sum(others, start=first)

@@ -26,14 +26,13 @@ def predict_with_jacobian(
     acceleration: Float[Array, "3"],
     acceleration_weights: Float[Array, " k"],
     gravity: Float[Array, "3"],
-    gravity_basis: Float[Array, "3 2"],
+    gravity_basis: Float[Array, "3 g"],
     bias: Float[Array, "6"],
-    bias_weights: Float[Array, " k"],
-) -> tuple[Float[Array, "6"], Float[Array, "6 k 12"], Float[Array, "6 2"]]:
-    """Readings as `predict`, and their Jacobians by the window of k control points and by the direction of gravity.
+) -> tuple[Float[Array, "6"], Float[Array, "6 k 6"], Float[Array, "6 g"]]:
+    """Readings as `predict`, and their Jacobians by the window of k control points and by gravity along its basis.
 
-    Each control point has 12 tangent coordinates: rotation (right perturbation), position, gyro bias, accel bias.
-    `acceleration_weights` are the second derivatives of the position basis; `bias_weights` those of the biases' basis.
+    Each control point has 6 tangent coordinates: rotation (right perturbation), position. `acceleration_weights` are
+    the second derivatives of the position basis. By `bias` the derivative is the identity.
     """
     order = acceleration_weights.shape[0]
     readings = predict(point.rotation, point.velocity, acceleration, gravity, bias)
@@ -43,6 +42,5 @@ def predict_with_jacobian(
         [point.velocity_jacobian, jnp.einsum("ij,jkl->ikl", so3.hat(force), point.rotation_jacobian)]
     )
     by_position = jnp.concatenate([zero, point.rotation.T[:, None, :] * acceleration_weights[None, :, None]])
-    by_bias = jnp.eye(6)[:, None, :] * bias_weights[None, :, None]
-    by_gravity = jnp.concatenate([jnp.zeros((3, 2)), -point.rotation.T @ gravity_basis])
-    return readings, jnp.concatenate([by_rotation, by_position, by_bias], axis=2), by_gravity
+    by_gravity = jnp.concatenate([jnp.zeros((3, gravity_basis.shape[1])), -point.rotation.T @ gravity_basis])
+    return readings, jnp.concatenate([by_rotation, by_position], axis=2), by_gravity

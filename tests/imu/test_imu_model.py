@@ -32,21 +32,19 @@ def random_window(order: int, seed: int) -> tuple[jax.Array, jax.Array, jax.Arra
 
 @functools.partial(jax.jit, static_argnums=4)
 def closed_form_and_autodiff(rotations: jax.Array, positions: jax.Array, biases: jax.Array, u: jax.Array, order: int):
-    """Readings (6,) and Jacobians (6, k, 12), (6, 2): as the model gives them, and by autodiff of `predict`."""
+    """Readings (6,) and Jacobians (6, k, 6), (6, 2): as the model gives them, and by autodiff of `predict`."""
     second = weights(basis_matrix(order), u, DT, 2)
     linear = jnp.zeros(order).at[0].set(1.0 - u).at[1].set(u)
     point = rotation_at(rotations[0], increments(rotations), u, DT, order)
-    ours = predict_with_jacobian(point, second @ positions, second, GRAVITY, BASIS, linear @ biases, linear)
+    ours = predict_with_jacobian(point, second @ positions, second, GRAVITY, BASIS, linear @ biases)
 
     def readings(window: jax.Array, tilt: jax.Array) -> jax.Array:
         moved = jnp.einsum("kij,kjl->kil", rotations, jax.vmap(so3.exp)(window[:, :3]))
         at = rotation_at(moved[0], increments(moved), u, DT, order)
         acceleration = second @ (positions + window[:, 3:6])
-        return predict(
-            at.rotation, at.velocity, acceleration, GRAVITY + BASIS @ tilt, linear @ (biases + window[:, 6:])
-        )
+        return predict(at.rotation, at.velocity, acceleration, GRAVITY + BASIS @ tilt, linear @ biases)
 
-    at_rest = (jnp.zeros((order, 12)), jnp.zeros(2))
+    at_rest = (jnp.zeros((order, 6)), jnp.zeros(2))
     return ours, (readings(*at_rest), *jax.jacfwd(readings, argnums=(0, 1))(*at_rest))
 
 
