@@ -50,7 +50,8 @@ class _LoopState(eqx.Module):
 class BlockArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Levenberg-Marquardt with structured linear algebra and steps on a manifold.
 
-    Called through `optimistix.least_squares` with `options={"problem": problem}`, `problem` a `BlockArrowProblem`.
+    Called through `optimistix.least_squares` with `options={"problem": problem}`, `problem` a `BlockArrowProblem`;
+    further options are `max_steps`, a coarser `rtol`, and the first `damping`.
     Damping after Nielsen (1999), scaled by the diagonal of H. It stops when the accepted state's next step, hardly
     damped, promises a decrease of the cost below `rtol * cost + atol`; the cost of noise-normalised residuals is half a
     chi-square, so that a promise of 1e-6 is a thousandth of a sigma.
@@ -72,7 +73,7 @@ class BlockArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             trial=y,
             predicted=jnp.array(jnp.inf),
             equations=eqx.tree_at(lambda e: e.cost, equations, jnp.array(jnp.inf)),
-            damping=jnp.array(_FIRST_DAMPING),
+            damping=jnp.asarray(options.get("damping", _FIRST_DAMPING)),
             raise_by=jnp.array(2.0),
             converged=jnp.array(False),
             stuck=jnp.array(False),
@@ -96,7 +97,7 @@ class BlockArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         damping, raise_by = _next_damping(accept, state.first, ratio, state.damping, state.raise_by)
 
         step = self._finite_step(damping, equations)
-        tolerance = self.rtol * equations.cost + self.atol
+        tolerance = jnp.maximum(self.rtol, options.get("rtol", 0.0)) * equations.cost + self.atol
         # A damped step promises little where a direction is weak, however far the optimum lies along it: ask again.
         refusals = state.refusals + (state.probing & ~accept)
         ask = accept & (step.predicted < tolerance) & (damping > _HARDLY_DAMPED) & (refusals < _MOST_REFUSALS)
@@ -201,18 +202,22 @@ def solve(
     *,
     solver: BlockArrowLevenbergMarquardt | None = None,
     max_steps: int = 100,
+    rtol: float = 0.0,
+    damping: float = _FIRST_DAMPING,
     adjoint: optx.AbstractAdjoint | None = None,
 ) -> SolveResult:
     """Minimise a block-arrow problem from `state`; one compiled program per problem shape.
+
+    `rtol` above the solver's own ends the search sooner, where the optimum is a step on the way to another problem's;
+    `damping` is the first step's, small where the start is known to be near.
 
     With `adjoint=GaussNewtonAdjoint()` the optimum can be differentiated by the problem's arrays (its data).
     """
     solver = solver or BlockArrowLevenbergMarquardt()
     with single_threaded_blas():
-        # The limit on steps is data of the program, so that calls with other limits need not compile another one.
-        return jax.block_until_ready(
-            _solve(problem, state, solver=solver, max_steps=jnp.asarray(max_steps), adjoint=adjoint)
-        )
+        # Limits are data of the program, so that calls with other ones need not compile another one.
+        limits = {"max_steps": jnp.asarray(max_steps), "rtol": jnp.asarray(rtol), "damping": jnp.asarray(damping)}
+        return jax.block_until_ready(_solve(problem, state, solver=solver, **limits, adjoint=adjoint))
 
 
 def solve_inside(
@@ -221,6 +226,8 @@ def solve_inside(
     *,
     solver: BlockArrowLevenbergMarquardt | None = None,
     max_steps: int | Int[Array, ""] = 100,
+    rtol: float | Float[Array, ""] = 0.0,
+    damping: float | Float[Array, ""] = _FIRST_DAMPING,
     adjoint: optx.AbstractAdjoint | None = None,
 ) -> SolveResult:
     """`solve` as a part of a larger jitted computation: many small problems under `lax.map`, say.
@@ -237,7 +244,7 @@ def solve_inside(
         untouched,
         solver,
         state,
-        options={"problem": problem, "max_steps": max_steps},
+        options={"problem": problem, "max_steps": max_steps, "rtol": rtol, "damping": damping},
         max_steps=None,
         throw=False,
         adjoint=adjoint or _NoAdjoint(),
