@@ -1,6 +1,6 @@
 """Time offset, rotation to the IMU and gyro bias from turning alone; gravity and a first trajectory."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,8 @@ STANDARD_GRAVITY = 9.80665
 _LONGEST_STEP_S = 0.2
 _COARSE_STEP_S = 0.01
 _FINE_STEP_S = 0.001
+# The gyroscope's integral is sampled so many times per coarse step.
+_GRID_PER_STEP = 4
 _LARGEST_SHIFT_S = 5.0
 _TRIM = 0.8
 _LEAST_CORRELATION = 0.4
@@ -63,6 +65,29 @@ class TurnIntegral:
         outside = (start < self._time[0]) | (stop > self._time[-1])
         rate[outside] = np.nan
         return rate
+
+    def mean_rates(
+        self, start: np.ndarray, stop: np.ndarray, step_s: float, most: int
+    ) -> Iterator[tuple[float, np.ndarray]]:
+        """`mean_rate` (3, n) over the spans moved by each of -most .. most steps, in this order.
+
+        The integral is sampled once on a grid finer than the step, so that moving a span is moving an index.
+        """
+        fine = step_s / _GRID_PER_STEP
+        grid = np.arange(self._time[0], self._time[-1], fine)
+        values = np.ascontiguousarray(self._at(grid).T)
+        # Where a span ends between samples of the grid stays as it is while it moves.
+        place = [(t - grid[0]) / fine for t in (start, stop)]
+        index = [np.floor(p).astype(np.int64) for p in place]
+        fraction = [p - i for p, i in zip(place, index, strict=True)]
+        for k in range(-most, most + 1):
+            first, last = (i + k * _GRID_PER_STEP for i in index)
+            inside = (first >= 0) & (last < len(grid) - 1)
+            ends = []
+            for i, f in ((first, fraction[0]), (last, fraction[1])):
+                i = np.where(inside, i, 0)
+                ends.append(values[:, i] * (1.0 - f) + values[:, i + 1] * f)
+            yield k * step_s, np.where(inside, (ends[1] - ends[0]) / (stop - start), np.nan)
 
 
 def align(track: CameraTrack, imu_time_s: np.ndarray, gyro: np.ndarray, name: str) -> Alignment:
@@ -145,18 +170,18 @@ def _camera_rates(track: CameraTrack, name: str) -> tuple[np.ndarray, np.ndarray
 
 def _coarse_shift(start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral) -> tuple[float, float]:
     """Offset with the largest correlation of rate magnitudes over at least half of the spans."""
-    magnitude = np.linalg.norm(rate, axis=1)
+    magnitude = np.minimum(np.linalg.norm(rate, axis=1), 20.0)
     best = (0.0, -1.0)
-    count = round(_LARGEST_SHIFT_S / _COARSE_STEP_S)
-    for k in range(-count, count + 1):
-        shift = k * _COARSE_STEP_S
-        other = np.linalg.norm(integral.mean_rate(start + shift, stop + shift), axis=1)
+    for shift, measured in integral.mean_rates(start, stop, _COARSE_STEP_S, round(_LARGEST_SHIFT_S / _COARSE_STEP_S)):
+        other = np.sqrt(np.sum(measured**2, axis=0))
         inside = np.isfinite(other)
-        if inside.sum() < 0.5 * len(magnitude):
+        count = np.count_nonzero(inside)
+        if count < 0.5 * len(magnitude):
             continue
-        a, b = np.minimum(magnitude[inside], 20.0), other[inside]
-        spread = np.std(a) * np.std(b)
-        correlation = float(np.mean((a - a.mean()) * (b - b.mean())) / spread) if spread > 0 else 0.0
+        a, b = (magnitude, other) if count == len(other) else (magnitude[inside], other[inside])
+        a, b = a - a.sum() / count, b - b.sum() / count
+        spread = np.sqrt((a @ a) * (b @ b))
+        correlation = float(a @ b / spread) if spread > 0 else 0.0
         # Among equals the smaller offset is the likelier.
         if correlation > best[1] + 1e-9:
             best = (shift, correlation)

@@ -1,5 +1,7 @@
 """Any camera model as the lens of a small fit: two compiled programs of one fixed size serve all its calls."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -60,8 +62,9 @@ def _with_lens(template: CameraModel, parameters: Array, points: Array) -> tuple
     """Pixels (2, M), Jacobian by the point (2, 3, M), validity (M), Jacobian by the lens (n, 2, M); all finite."""
 
     def one(point: Array) -> tuple[Array, Array, Array, Array]:
-        by_lens, by_point = jax.jacrev(lambda *at: _pixel(template, *at), argnums=(0, 1))(parameters, point)
-        return _finite(_pixel(template, parameters, point), by_point, by_lens.T)
+        pixel, pull = jax.vjp(lambda *at: _pixel(template, *at), parameters, point)
+        by_lens, by_point = _pulled(pull)
+        return _finite(pixel, by_point, by_lens.T)
 
     return jax.vmap(one, out_axes=-1)(points)
 
@@ -71,10 +74,16 @@ def _without_lens(template: CameraModel, parameters: Array, points: Array) -> tu
     """As `_with_lens`, less the Jacobian by the lens."""
 
     def one(point: Array) -> tuple[Array, Array, Array]:
-        by_point = jax.jacrev(lambda at: _pixel(template, parameters, at))(point)
-        return _finite(_pixel(template, parameters, point), by_point, jnp.zeros(0))[:3]
+        pixel, pull = jax.vjp(lambda at: _pixel(template, parameters, at), point)
+        return _finite(pixel, *_pulled(pull), jnp.zeros(0))[:3]
 
     return jax.vmap(one, out_axes=-1)(points)
+
+
+def _pulled(pull: Callable[[Array], tuple[Array, ...]]) -> tuple[Array, ...]:
+    """Jacobians of a pixel, coordinate by coordinate: twice as fast as `jacrev` with its batch of unit vectors."""
+    rows = zip(pull(jnp.array([1.0, 0.0])), pull(jnp.array([0.0, 1.0])), strict=True)
+    return tuple(jnp.stack(both) for both in rows)
 
 
 def _finite(pixel: Array, by_point: Array, by_lens: Array) -> tuple[Array, Array, Array, Array]:

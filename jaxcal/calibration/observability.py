@@ -122,21 +122,22 @@ def advice(
 
 def _what_was_seen(frames: CameraFrames, kept: np.ndarray, T: np.ndarray, points: np.ndarray) -> _Seen:
     rows = np.flatnonzero(kept.any(axis=1) & np.isfinite(T).all(axis=(1, 2)))
-    tilts, depths = np.zeros(len(rows)), np.zeros(len(rows))
-    for k, row in enumerate(rows):
-        in_camera = points[kept[row]] @ T[row, :3, :3].T + T[row, :3, 3]
-        tilts[k], depths[k] = _tilt_deg(in_camera), in_camera[:, 2].mean()
-    return _Seen(tilts, depths, frames.pixels[kept])
+    in_camera = points @ T[rows, :3, :3].swapaxes(-1, -2) + T[rows, None, :3, 3]
+    depth = np.sum(np.where(kept[rows], in_camera[..., 2], 0.0), axis=1) / kept[rows].sum(axis=1)
+    return _Seen(_tilt_deg(in_camera, kept[rows]), depth, frames.pixels[kept])
 
 
-def _tilt_deg(points: np.ndarray) -> float:
-    """Angle of points (M, 3) to the image plane, by how their depth changes across it; boards in several planes count
-    as tilted by what no plane explains."""
-    centred = points - points.mean(axis=0)
-    slope = np.linalg.lstsq(centred[:, :2], centred[:, 2], rcond=1e-9)[0]
-    beyond = np.sqrt(np.mean((centred[:, 2] - centred[:, :2] @ slope) ** 2))
-    width = np.sqrt(np.mean(np.sum(centred[:, :2] ** 2, axis=1)))
-    return float(np.degrees(np.arctan(np.hypot(np.linalg.norm(slope), beyond / max(width, 1e-12)))))
+def _tilt_deg(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Angle (F,) of points (F, M, 3), where `seen` (F, M), to the image plane, by how their depth changes across it;
+    boards in several planes count as tilted by what no plane explains."""
+    count = seen.sum(axis=1)
+    share = seen / count[:, None]
+    centred = np.where(seen[..., None], points - np.einsum("fm,fmi->fi", share, points)[:, None], 0.0)
+    across, depth = centred[..., :2], centred[..., 2]
+    slope = np.einsum("fim,fm->fi", np.linalg.pinv(across, rcond=1e-9), depth)
+    beyond = np.sqrt(np.sum((depth - np.einsum("fmi,fi->fm", across, slope)) ** 2, axis=1) / count)
+    width = np.sqrt(np.sum(across**2, axis=(1, 2)) / count)
+    return np.degrees(np.arctan(np.hypot(np.linalg.norm(slope, axis=1), beyond / np.maximum(width, 1e-12))))
 
 
 def _few_views(name: str, seen: _Seen, of_lens: Sequence[_Quantity], covariance: np.ndarray) -> list[str]:

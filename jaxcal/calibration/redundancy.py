@@ -42,12 +42,13 @@ def view_features(frames: CameraFrames) -> np.ndarray:
     """Where and how the board stands in each image (F, 6): centre, spread, shear in units of the image's longer side,
     and the share of the board that is seen."""
     scale = float(max(frames.detections.image_size))
-    features = np.empty((len(frames.frames), 6))
-    for f, (pixels, seen) in enumerate(zip(frames.pixels, frames.seen, strict=True)):
-        xy = pixels[seen] / scale
-        spread = np.cov(xy.T)
-        features[f] = [*xy.mean(axis=0), *np.sqrt(np.maximum(np.diag(spread), 0)), spread[0, 1] * 10, seen.mean()]
-    return features
+    count = np.maximum(frames.seen.sum(axis=1), 2)[:, None]
+    xy = np.where(frames.seen[..., None], frames.pixels / scale, 0.0)
+    middle = xy.sum(axis=1) / count
+    centred = np.where(frames.seen[..., None], xy - middle[:, None], 0.0)
+    spread = np.sqrt(np.sum(centred**2, axis=1) / (count - 1))
+    shear = np.sum(centred[..., 0] * centred[..., 1], axis=1, keepdims=True) / (count - 1)
+    return np.concatenate([middle, spread, 10.0 * shear, frames.seen.mean(axis=1, keepdims=True)], axis=1)
 
 
 def measure_redundancy(frames: CameraFrames, errors: np.ndarray, usable: np.ndarray, sigma: float) -> Redundancy:

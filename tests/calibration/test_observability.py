@@ -162,12 +162,16 @@ def test_the_sigma_of_the_focal_length_is_that_of_the_calibration(good: Calibrat
 def test_the_tilt_of_a_board(angle: float) -> None:
     turn = np.deg2rad(angle)
     tilted = BOARD.points @ np.array([[1.0, 0.0, 0.0], [0.0, np.cos(turn), 0.0], [0.0, np.sin(turn), 0.0]]).T
-    assert observability._tilt_deg(tilted + np.array([0.1, 0.2, 1.0])) == pytest.approx(angle, abs=1e-6)
+    seen = np.ones((2, len(tilted)), dtype=bool)
+    seen[1, ::3] = False  # of the second view a part is hidden, and lies anywhere
+    views = np.stack([tilted, np.where(seen[1][:, None], tilted, 7.0)]) + np.array([0.1, 0.2, 1.0])
+    np.testing.assert_allclose(observability._tilt_deg(views, seen), angle, atol=1e-6)
 
 
 def test_boards_at_an_angle_to_each_other_count_as_tilted() -> None:
     walls = np.concatenate([BOARD.points, BOARD.points[:, [2, 1, 0]]])
-    assert observability._tilt_deg(walls + np.array([0.0, 0.0, 1.0])) > 30.0
+    seen = np.ones((1, len(walls)), dtype=bool)
+    assert observability._tilt_deg(walls[None] + np.array([0.0, 0.0, 1.0]), seen)[0] > 30.0
 
 
 def test_weak_directions_are_named_once_and_strong_ones_not() -> None:
