@@ -1,8 +1,8 @@
 """From what corners and IMUs say of windows of the chain to the block-arrow normal equations of the whole rig.
 
-Corners touch poses alone, an IMU's sample its own biases besides. Both are summed as narrow windows, pose by pose and
-bias by bias, and brought into the band last: windows padded to all coordinates of a chain block would be ten times the
-memory, and moving that was most of the time of an iteration.
+Corners touch poses alone, an IMU's sample its own biases besides. Both are summed by themselves and brought
+into the band last: windows padded to all coordinates of a chain block are ten times the memory, and moving that was
+most of the time of an iteration.
 """
 
 from collections.abc import Sequence
@@ -24,16 +24,16 @@ from jaxcal.estimation import BlockArrow, band_from_windows, chain_from_windows,
 
 
 class PoseEquations(eqx.Module):
-    """What all corners say of the poses in each window of k chain blocks, and of the shared parameters.
+    """What all corners say of the chain's poses, and of the shared parameters.
 
     `cameras` and `others` are the poses' products with the shared coordinates before those of IMUs and gravity, and
     after them.
     """
 
-    window: Float[Array, "I k 6 k 6"]
-    cameras: Float[Array, "I k 6 c"]
-    others: Float[Array, "I k 6 o"]
-    gradient: Float[Array, "I k 6"]
+    band: Float[Array, "K w 6 6"]
+    cameras: Float[Array, "K 6 c"]
+    others: Float[Array, "K 6 o"]
+    gradient: Float[Array, "K 6"]
     corner: Float[Array, "P P"]
     gradient_shared: Float[Array, " P"]
     cost: Float[Array, ""]
@@ -42,12 +42,11 @@ class PoseEquations(eqx.Module):
 def of_poses(corners: PoseEquations, layout: SharedLayout) -> BlockArrow:
     """Equations of cameras alone: a chain of poses."""
     none = jnp.zeros((*corners.gradient.shape, layout.gravity_size))
-    border = jnp.concatenate([corners.cameras, none, corners.others], axis=-1)
     return BlockArrow(
-        band=band_from_windows(corners.window),
-        border=chain_from_windows(border),
+        band=corners.band,
+        border=jnp.concatenate([corners.cameras, none, corners.others], axis=-1),
         corner=corners.corner,
-        gradient_chain=chain_from_windows(corners.gradient),
+        gradient_chain=corners.gradient,
         gradient_shared=corners.gradient_shared,
         cost=corners.cost,
     )
@@ -60,19 +59,19 @@ def with_imus(
     parameters."""
     imus = [linearise_imu(state, data, order, layout, i) for i in range(len(layout.imus))]
     prior = linearise_prior(state, data)
-    window, gradient, cost = corners.window, corners.gradient, corners.cost + prior.cost
+    poses, gradient, cost = corners.band, corners.gradient, corners.cost + prior.cost
     corner, gradient_shared = corners.corner, corners.gradient_shared
     for i, imu in enumerate(imus):
         usual = linearise_model_prior(state, layout, i)
         own, columns = layout.imu(i), np.r_[layout.imu(i), layout.gravity]
-        window, gradient = window + imu.window, gradient + imu.gradient
+        poses, gradient = poses + band_from_windows(imu.window), gradient + chain_from_windows(imu.gradient)
         corner = corner.at[columns[:, None], columns].add(imu.shared).at[own, own].add(usual.information)
         gradient_shared = gradient_shared.at[columns].add(imu.gradient_shared).at[own].add(usual.gradient)
         cost = cost + imu.cost + usual.cost
 
     blocks = state.positions.shape[0]
-    chains = [chain_from_windows(gradient), *(chain_from_windows(imu.gradient_bias, blocks) for imu in imus)]
-    band = _band(band_from_windows(window), imus)
+    chains = [gradient, *(chain_from_windows(imu.gradient_bias, blocks) for imu in imus)]
+    band = _band(poses, imus)
     return BlockArrow(
         band=band + jnp.pad(prior.band, [(0, 0), (0, order - prior.band.shape[1]), (0, 0), (0, 0)]),
         border=_border(corners, imus, layout, blocks),
@@ -88,9 +87,10 @@ def _border(
 ) -> Float[Array, "K B P"]:
     """Products of chain and shared coordinates."""
     gravity = layout.gravity_size
-    own = [imu.cross[..., :-gravity] for imu in imus]
-    pulled = sum((imu.cross[..., -gravity:] for imu in imus[1:]), start=imus[0].cross[..., -gravity:])
-    rows = [chain_from_windows(jnp.concatenate([corners.cameras, *own, pulled, corners.others], axis=-1))]
+    first, *others = crosses = [chain_from_windows(imu.cross) for imu in imus]
+    pulled = sum((cross[..., -gravity:] for cross in others), start=first[..., -gravity:])
+    own = (cross[..., :-gravity] for cross in crosses)
+    rows = [jnp.concatenate([corners.cameras, *own, pulled, corners.others], axis=-1)]
     for i, imu in enumerate(imus):
         place, others = layout.imu(i), layout.size - layout.gravity.stop
         columns = chain_from_windows(imu.bias_cross, blocks)

@@ -14,7 +14,7 @@ from jaxcal.calibration.state import RigState, SharedLayout
 from jaxcal.calibration.target_shape import TargetGeometry, points_by_target, target_points
 from jaxcal.calibration.vision import FrameEquations, FramePoses, VisionData
 from jaxcal.cameras import CameraModel
-from jaxcal.estimation import BlockArrow, robust_loss
+from jaxcal.estimation import BlockArrow, robust_loss, scattered_band, scattered_chain
 from jaxcal.trajectory import PoseSpline
 
 
@@ -121,11 +121,10 @@ class RigProblem(eqx.Module):
 
     def _vision(self, state: RigState) -> PoseEquations:
         points, by_target = self.target_arrays(state)
-        intervals = state.positions.shape[0] - self.order + 1
-        targets = self.layout.target_size
-        window = jnp.zeros((intervals, self.order, 6, self.order, 6))
-        gradient_window = jnp.zeros((intervals, self.order, 6))
-        border_target = jnp.zeros((intervals, self.order, 6, targets))
+        blocks, targets = state.positions.shape[0], self.layout.target_size
+        band = jnp.zeros((blocks, self.order, 6, 6))
+        chain = jnp.zeros((blocks, 6))
+        border_target = jnp.zeros((blocks, 6, targets))
         shared = jnp.zeros((self.layout.size, self.layout.size))
         gradient = jnp.zeros(self.layout.size)
         borders: dict[int, Array] = {}
@@ -133,28 +132,27 @@ class RigProblem(eqx.Module):
         cost = jnp.zeros(())
         for group in range(len(self.corners)):
             frames = self._frames(state, group, points, by_target)
-            window = window.at[frames.start].add(frames.window)
-            gradient_window = gradient_window.at[frames.start].add(frames.gradient_window)
+            band = band + scattered_band(frames.start, frames.window, blocks)
+            chain = chain + scattered_chain(frames.start, frames.gradient_window, blocks)
             cost = cost + frames.cost
-            members, lens = self.layout.groups[group], state.lenses[group].shape[1]
-            own = frames.cross[..., : 7 + lens]
-            border = jnp.zeros((len(members), intervals, *own.shape[1:])).at[frames.camera, frames.start].add(own)
-            if targets:
-                border_target = border_target.at[frames.start].add(frames.cross[..., -targets:])
+            lens = state.lenses[group].shape[1]
+            members = self.layout.groups[group]
+            # The chains of the group's cameras end to end, so that each frame is put down once.
+            rows = scattered_chain(frames.camera * blocks + frames.start, frames.cross, len(members) * blocks)
             for place, camera in enumerate(members):
-                borders[camera] = jnp.concatenate([border[place, ..., 7:], border[place, ..., :7]], axis=-1)
+                border = rows[place * blocks : (place + 1) * blocks]
+                borders[camera] = jnp.concatenate([border[..., 7 : 7 + lens], border[..., :7]], axis=-1)
                 if self.layout.is_rolling(camera):
-                    of_camera = jnp.where((frames.camera == place)[:, None, None], frames.cross[..., 7 + lens], 0.0)
-                    delays.append(jnp.zeros((intervals, self.order, 6)).at[frames.start].add(of_camera)[..., None])
+                    delays.append(border[..., 7 + lens : 8 + lens])
+                border_target = border_target + border[..., border.shape[-1] - targets :]
                 columns = self.columns(camera)
                 shared = shared.at[columns[:, None], columns].add(frames.shared[place])
                 gradient = gradient.at[columns].add(frames.gradient_shared[place])
-
         return PoseEquations(
-            window=window,
+            band=band,
             cameras=jnp.concatenate([borders[c] for c in range(self.layout.num_cameras)], axis=-1),
             others=jnp.concatenate([*delays, border_target], axis=-1),
-            gradient=gradient_window,
+            gradient=chain,
             corner=shared,
             gradient_shared=gradient,
             cost=cost,

@@ -7,6 +7,8 @@ from jaxcal.estimation.block_arrow import (
     band_from_windows,
     chain_from_windows,
     factorise,
+    scattered_band,
+    scattered_chain,
     sum_along_chain,
 )
 from jaxcal.estimation.descent import BlockArrowDescent, BlockStep, damped_step
@@ -34,6 +36,8 @@ __all__ = [
     "factorise",
     "huber",
     "robust_loss",
+    "scattered_band",
+    "scattered_chain",
     "single_threaded_blas",
     "solve",
     "solve_inside",

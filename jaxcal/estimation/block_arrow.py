@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 
 class BlockArrow(eqx.Module):
@@ -253,6 +253,29 @@ def chain_from_windows(windows: Float[Array, "I w B *rest"], blocks: int | None 
     """Sum per-interval gradients or border rows over the chain of K blocks, by default K = I + w - 1."""
     intervals, width = windows.shape[:2]
     return sum_along_chain([(a, windows[:, a]) for a in range(width)], blocks or intervals + width - 1)
+
+
+def scattered_band(start: Int[Array, " M"], windows: Float[Array, "M w B w B"], blocks: int) -> Float[Array, "K w B B"]:
+    """As `band_from_windows` for measurements whose windows start at chain blocks `start`, several at the same or none.
+
+    Diagonal by diagonal: scattering whole windows first takes five times as long.
+    """
+    _, width, size = windows.shape[:3]
+    band = jnp.zeros((blocks, width, size, size))
+    for d in range(width):
+        for a in range(width - d):
+            band = band.at[start + a, d].add(windows[:, a + d, :, a, :])
+    return band
+
+
+def scattered_chain(
+    start: Int[Array, " M"], windows: Float[Array, "M w B *rest"], blocks: int
+) -> Float[Array, "K B *rest"]:
+    """As `chain_from_windows` for measurements whose windows start at chain blocks `start`."""
+    chain = jnp.zeros((blocks, *windows.shape[2:]))
+    for a in range(windows.shape[1]):
+        chain = chain.at[start + a].add(windows[:, a])
+    return chain
 
 
 def sum_along_chain(parts: Sequence[tuple[int, Float[Array, "I *rest"]]], blocks: int) -> Float[Array, "K *rest"]:
