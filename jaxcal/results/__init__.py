@@ -11,6 +11,7 @@ from jaxcal.results.kalibr import CamchainCamera, load_camchain
 from jaxcal.results.projection_uncertainty import ProjectionUncertainty, projection_uncertainty
 from jaxcal.results.text import results_text
 from jaxcal.results.verdict import Verdict, judge
+from jaxcal.results.whiteness import ResidualStatistics, residual_statistics
 
 if TYPE_CHECKING:
     from jaxcal.results.report import write_report
@@ -22,6 +23,7 @@ __all__ = [
     "CameraCalibration",
     "ImuCalibration",
     "ProjectionUncertainty",
+    "ResidualStatistics",
     "RigDifference",
     "TargetShape",
     "Verdict",
@@ -31,6 +33,7 @@ __all__ = [
     "load_camchain",
     "projection_uncertainty",
     "read_calibration",
+    "residual_statistics",
     "results_text",
     "rig_of",
     "save_calibration",

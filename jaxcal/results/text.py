@@ -7,6 +7,7 @@ from jaxcal.cameras import model_name
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
 from jaxcal.results.parameters import sigma_of
 from jaxcal.results.projection_uncertainty import can_be_told, projection_uncertainty
+from jaxcal.results.whiteness import residual_statistics
 from jaxcal.targets import AprilGrid, Target
 
 
@@ -210,6 +211,8 @@ def _imu_configuration(imu: ImuCalibration, number: int) -> str:
             f"    Noise density (discrete): {imu.gyro_sigma}",
             f"    Random walk: {imu.noise['gyroscope_random_walk']}",
             *_noise_shown(imu),
+            "  Residuals, in units of the noise used:",
+            *(f"    {statistics.sentence()}" for statistics in residual_statistics(imu)),
             f"  Spline: order {imu.spline_order}, {imu.knot_rate_hz:g} knots per second",
         ]
     )

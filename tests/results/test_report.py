@@ -26,11 +26,12 @@ from jaxcal.results import Calibration, judge, write_report
 from jaxcal.results.report.camera_figures import frame_rms
 from jaxcal.results.report.drawing import label, panel, to_svg
 from jaxcal.results.report.frames import frame_pictures
-from jaxcal.results.report.imu_figures import _envelope, autocorrelation
+from jaxcal.results.report.imu_figures import _envelope
 from jaxcal.results.report.lens_figure import _looked, lens_picture
 from jaxcal.results.report.rig_figures import rig_pictures, rig_poses
 from jaxcal.results.report.rig_scene import look, rig_scene
 from jaxcal.results.report.time_figure import time_picture
+from jaxcal.results.whiteness import autocorrelation
 
 VOID = {"meta", "link", "br", "hr", "img", "input"}
 CAMERA_FIGURES, IMU_FIGURES = 8, 10

@@ -1,6 +1,7 @@
 """The figures of the IMU: what it measured against the estimated motion, its residuals and its biases."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from jaxcal.results.report.drawing import (
     panel,
     to_svg,
 )
+from jaxcal.results.whiteness import ResidualStatistics, autocorrelation, residual_statistics
 
 _TALL = (4.4, 4.0)
 _ENVELOPE_BINS = 450
@@ -64,7 +66,7 @@ def imu_pictures(imu: ImuCalibration, prefix: str) -> list[Picture]:
         _bias_picture(gyro, imu.t_s, f"{prefix}-gyro-bias"),
         _bias_picture(accel, imu.t_s, f"{prefix}-accel-bias"),
         _fit_picture((gyro, accel), imu.t_s, f"{prefix}-fit"),
-        _whiteness_picture((gyro, accel), imu.t_s, f"{prefix}-whiteness"),
+        _whiteness_picture((gyro, accel), imu.t_s, residual_statistics(imu), f"{prefix}-whiteness"),
     ]
 
 
@@ -190,17 +192,9 @@ def _bias_picture(sensor: _Sensor, t: np.ndarray, prefix: str) -> Picture:
     )
 
 
-def autocorrelation(values: np.ndarray, lags: int) -> np.ndarray:
-    """Correlation (lags,) of a series (N,) with itself 1 .. lags samples later; NaN entries take no part."""
-    known = np.isfinite(values)
-    centred = np.where(known, values - np.mean(values[known]) if known.any() else 0.0, 0.0)
-    variance = np.sum(centred**2) / max(int(known.sum()), 1)
-    pairs = np.array([np.sum(known[k:] & known[: len(known) - k]) for k in range(1, lags + 1)])
-    products = np.array([centred[k:] @ centred[: len(centred) - k] for k in range(1, lags + 1)])
-    return products / np.maximum(pairs, 1) / max(variance, np.finfo(np.float64).tiny)
-
-
-def _whiteness_picture(sensors: tuple[_Sensor, _Sensor], t: np.ndarray, prefix: str) -> Picture:
+def _whiteness_picture(
+    sensors: tuple[_Sensor, _Sensor], t: np.ndarray, statistics: Sequence[ResidualStatistics], prefix: str
+) -> Picture:
     figure, rows = panel(2, _TALL)
     lags = max(1, min(_LAGS, len(t) // 4))
     seconds = np.arange(1, lags + 1) * float(np.median(np.diff(t)))
@@ -224,7 +218,7 @@ def _whiteness_picture(sensors: tuple[_Sensor, _Sensor], t: np.ndarray, prefix: 
         "Residuals, whiteness",
         to_svg(figure, prefix),
         "Correlation of the residuals with themselves a little later; the band is what chance gives (2 sigma). "
-        f"The largest is {max(largest):.2f}.",
+        f"The largest is {max(largest):.2f}. " + "; ".join(one.sentence() for one in statistics) + ".",
         "lines inside the band but for a few: the residuals are noise, and the sigmas can be believed.",
         "lines well above it are motion that the spline cannot follow (more knots per second), vibration, or a wrong "
         "clock: sigmas are then too small unless the noise was raised.",
