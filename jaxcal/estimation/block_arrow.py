@@ -277,8 +277,13 @@ def scattered_chain(
 
 
 def sum_along_chain(parts: Sequence[tuple[int, Float[Array, "I *rest"]]], blocks: int) -> Float[Array, "K *rest"]:
-    """Sum of `parts`, each an offset and what it adds to the chain blocks from there on, in one pass over memory."""
-    first, *others = [
-        jnp.pad(part, [(offset, blocks - offset - len(part)), *[(0, 0)] * (part.ndim - 1)]) for offset, part in parts
-    ]
-    return sum(others, start=first)
+    """Sum of `parts`, each an offset and what it adds to the chain blocks from there on.
+
+    In place, part by part: as a sum of padded arrays it is one loop, and a third faster, but jax 0.10.2 compiled that
+    into wrong sums in every other row of one column (four parts of two IMUs, on the CPU; right without
+    `xla_cpu_use_fusion_emitters`).
+    """
+    total = jnp.zeros((blocks, *parts[0][1].shape[1:]))
+    for offset, part in parts:
+        total = total.at[offset : offset + len(part)].add(part)
+    return total
