@@ -24,6 +24,7 @@ from jaxcal.calibration.state import RigState, SharedLayout, flat_target, layout
 from jaxcal.calibration.target_shape import geometry_of
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
+from jaxcal.estimation import LOSSES, Loss
 from jaxcal.imu import imu_model
 from jaxcal.observations import Detections, ImuRecording
 from jaxcal.progress import Progress, no_progress, track
@@ -51,6 +52,7 @@ def calibrate_camera_imu(
     names: Sequence[str] | None = None,
     intrinsics: Literal["free", "prior", "held"] = "free",
     imu_noise: Literal["at least given", "given", "estimated"] = "at least given",
+    loss: Loss = "huber",
     spline_order: int = 6,
     knot_rate_hz: float | None = None,
     max_steps: int = 60,
@@ -66,20 +68,16 @@ def calibrate_camera_imu(
     or one each: 'calibrated', 'scale-misalignment', 'scale-misalignment-size-effect' (`jaxcal.imu`).
     `gravity_magnitude` estimates the strength of gravity too, rather than its direction alone. `rolling_shutter`, for
     all cameras or one each: rows are seen one after another, and the delay of a row is estimated; a frame's time is
-    that of its first row. `cameras` an earlier
-    calibration of the same cameras to start from. `intrinsics`: estimate the lenses freely, under the prior of
-    `cameras`, or hold them. `imu_noise`: 'given' trusts the noise densities; 'at least given' raises them where the
-    residuals are larger, so that sigmas stay honest; 'estimated' takes what the residuals show, larger or smaller.
-    `spline_order` 4 to 6 and `knot_rate_hz`, chosen from the first IMU's own spectrum by default.
+    that of its first row. `cameras` an earlier calibration of the same cameras to start from. `intrinsics`: estimate
+    the lenses freely, under the prior of `cameras`, or hold them. `imu_noise`: 'given' trusts the noise densities; 'at
+    least given' raises them where the residuals are larger, so that sigmas stay honest; 'estimated' takes what the
+    residuals show, larger or smaller. `loss`: the robust loss under which outlying corners are found, as for
+    `calibrate_cameras`; they are left out of the final least squares. `spline_order` 4 to 6 and
+    `knot_rate_hz`, chosen from the first IMU's own spectrum by default.
 
     Raises CalibrationError when frames and IMU do not overlap or do not move together, and as `calibrate_cameras`.
     """
-    if spline_order not in (4, 5, 6):
-        raise CalibrationError(f"spline_order is {spline_order}; expected 4, 5 or 6.")
-    if len(target.boards) > 1:
-        raise CalibrationError(f"the target has {len(target.boards)} boards; calibrate with one (with an IMU).")
-    if intrinsics != "free" and cameras is None:
-        raise CalibrationError(f"intrinsics='{intrinsics}' needs `cameras`, the calibration that they come from.")
+    _check_options(target, spline_order, loss, intrinsics, cameras)
     names = resolve_names(detections, names)
     frames = [camera_frames(d, target, name) for d, name in zip(detections, names, strict=True)]
     lenses = _first_lenses(names, detections, models, cameras, frames, target, progress)
@@ -91,13 +89,7 @@ def calibrate_camera_imu(
     start = _align_all(names, lenses, frames, target, first, imu_time)
     others = extra_imus.align_others(start.tracks[start.reference], start.alignments[start.reference], imus)
     grid = _grid(start, imu_time, first, spline_order, knot_rate_hz)
-    usable = [
-        (t + a.shift_s > grid.start + _EDGE_S) & (t + a.shift_s < grid.stop - _EDGE_S)
-        for t, a in zip(start.times, start.alignments, strict=True)
-    ]
-    for name, ok in zip(names, usable, strict=True):
-        if ok.sum() < 3:
-            raise CalibrationError(f"{name}: {ok.sum()} frames lie within the IMU recording; at least 3 are needed.")
+    usable = _usable_frames(names, start, grid)
     binned = extra_imus.bin_all(grid, imus, [place.shift_s for place in others])
     shutters = shutters_of(rolling_shutter, len(names))
     layout = layout_of(
@@ -106,7 +98,7 @@ def calibrate_camera_imu(
         gravity_size=3 if gravity_magnitude else 2,
         rolling=shutters,
     )
-    problem = _problem(lenses, frames, target, start, binned, grid, cameras, names, intrinsics, layout)
+    problem = _problem(lenses, frames, target, start, binned, grid, cameras, names, intrinsics, layout, loss)
     state = _first_state(lenses, layout, start, others, grid, first, imu_time)
 
     noise = inertial_noise.NoiseModel(binned, grid, imu_noise)
@@ -131,6 +123,7 @@ def calibrate_camera_imu(
         "rolling_shutter": shutters,
         "intrinsics": intrinsics,
         "imu_noise": imu_noise,
+        "loss": loss,
         "spline_order": spline_order,
         "knot_rate_hz": 1.0 / grid.dt,
         "max_steps": max_steps,
@@ -146,6 +139,19 @@ def calibrate_camera_imu(
         warnings=[*sentences, *noise.warnings(fit)],
         settings=settings,
     )
+
+
+def _check_options(target: Target, spline_order: int, loss: str, intrinsics: str, cameras: Calibration | None) -> None:
+    if spline_order not in (4, 5, 6):
+        raise CalibrationError(f"spline_order is {spline_order}; expected 4, 5 or 6.")
+    if loss not in LOSSES:
+        raise CalibrationError(f"robust loss '{loss}' is unknown; known: {', '.join(LOSSES)}.")
+    if len(target.boards) > 1:
+        raise CalibrationError(f"the target has {len(target.boards)} boards; calibrate with one (with an IMU).")
+    if intrinsics not in ("free", "prior", "held"):
+        raise CalibrationError(f"intrinsics is '{intrinsics}'; expected free, prior or held.")
+    if intrinsics != "free" and cameras is None:
+        raise CalibrationError(f"intrinsics='{intrinsics}' needs `cameras`, the calibration that they come from.")
 
 
 def _imu_models(models: str | Sequence[str], count: int) -> list[str]:
@@ -230,6 +236,18 @@ def _grid(start: _Start, imu_time: np.ndarray, imu: ImuRecording, order: int, kn
     return spline_setup.make_grid(first, last, order, knot_rate_hz)
 
 
+def _usable_frames(names: Sequence[str], start: _Start, grid: SplineGrid) -> list[np.ndarray]:
+    """Which frames (F,) of each camera lie on the trajectory."""
+    usable = [
+        (t + a.shift_s > grid.start + _EDGE_S) & (t + a.shift_s < grid.stop - _EDGE_S)
+        for t, a in zip(start.times, start.alignments, strict=True)
+    ]
+    for name, ok in zip(names, usable, strict=True):
+        if ok.sum() < 3:
+            raise CalibrationError(f"{name}: {ok.sum()} frames lie within the IMU recording; at least 3 are needed.")
+    return usable
+
+
 def _problem(
     lenses: Sequence[CameraModel],
     frames: Sequence[CameraFrames],
@@ -241,6 +259,7 @@ def _problem(
     names: Sequence[str],
     intrinsics: str,
     layout: SharedLayout,
+    loss: Loss,
 ) -> RigProblem:
     free = solving.free_coordinates(lenses, layout)
     if intrinsics == "held":
@@ -261,6 +280,7 @@ def _problem(
         basis=own_parameters(lenses, layout),
         layout=layout,
         order=grid.order,
+        loss=loss,
         row_intervals=row_intervals(layout, grid.dt),
     )
 

@@ -20,6 +20,11 @@ _LARGEST_SHIFT_S = 5.0
 _TRIM = 0.8
 _LEAST_CORRELATION = 0.4
 _LEAST_TURNING = 0.05
+# Offsets of the halves of a recording further apart than this are two offsets, where each half has so many frames and
+# its turning leaves so little unexplained (s; frames; share).
+_LARGEST_JUMP_S = 0.01
+_LEAST_HALF = 40
+_CLEARLY_EXPLAINED = 0.05
 # How many times faster than the camera the gyroscope may seem to turn, or slower.
 _LARGEST_SCALE = 2.0
 # The share of the gyroscope's variance that the camera's turning may leave unexplained. Real and simulated recordings
@@ -108,28 +113,62 @@ def align(track: CameraTrack, imu_time_s: np.ndarray, gyro: np.ndarray, name: st
         )
     coarse, correlation = _coarse_shift(start, stop, rate, integral)
     if correlation < _LEAST_CORRELATION:
+        _check_clock(start, stop, rate, integral, name)
         raise CalibrationError(
             f"{name}: its turning does not match the IMU's (correlation {correlation:.2f} at best, within "
             f"{_LARGEST_SHIFT_S:g} s). Are camera and IMU from the same recording, on clocks less than "
             f"{_LARGEST_SHIFT_S:g} s apart, and is the gyroscope in rad/s?"
         )
     _check_scale(rate, integral.mean_rate(start + coarse, stop + coarse), name)
-    grid = coarse + np.arange(-15, 16) * _FINE_STEP_S
-    costs = np.array([_rotation(start + s, stop + s, rate, integral)[2] for s in grid])
-    best = int(np.clip(np.argmin(costs), 1, len(grid) - 2))
-    left, middle, right = costs[best - 1 : best + 2]
-    bend = left - 2.0 * middle + right
-    shift = float(grid[best] + (0.5 * (left - right) / bend if bend > 0 else 0.0) * _FINE_STEP_S)
-    R_imu_cam, bias, cost, spread = _rotation(start + shift, stop + shift, rate, integral)
-    measured = integral.mean_rate(start + shift, stop + shift)
-    unexplained = cost / float(np.nansum(np.nanvar(measured, axis=0)))
+    _check_clock(start, stop, rate, integral, name)
+    shift, unexplained = _fine_shift(start, stop, rate, integral, coarse)
     if unexplained > _LARGEST_UNEXPLAINED:
         raise CalibrationError(
             f"{name}: its turning does not match the IMU's: the best time offset ({shift:.3f} s) and rotation leave "
             f"{100 * unexplained:.0f} % of the gyroscope's variance unexplained. Are camera and IMU from the same "
             "recording, and are the frames' corners and times right?"
         )
+    R_imu_cam, bias, _, spread = _rotation(start + shift, stop + shift, rate, integral)
     return Alignment(shift, R_imu_cam.T, bias, correlation, spread)
+
+
+def _fine_shift(
+    start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral, coarse: float
+) -> tuple[float, float]:
+    """The offset near `coarse` at which the best rotation leaves least, and the share of the gyroscope's variance that
+    it leaves."""
+    grid = coarse + np.arange(-15, 16) * _FINE_STEP_S
+    costs = np.array([_rotation(start + s, stop + s, rate, integral)[2] for s in grid])
+    best = int(np.clip(np.argmin(costs), 1, len(grid) - 2))
+    left, middle, right = costs[best - 1 : best + 2]
+    bend = left - 2.0 * middle + right
+    shift = float(grid[best] + (0.5 * (left - right) / bend if bend > 0 else 0.0) * _FINE_STEP_S)
+    cost = _rotation(start + shift, stop + shift, rate, integral)[2]
+    measured = integral.mean_rate(start + shift, stop + shift)
+    return shift, cost / float(np.nansum(np.nanvar(measured, axis=0)))
+
+
+def _check_clock(start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral, name: str) -> None:
+    """Raise CalibrationError when the offset that serves the first half of the recording is not that of the second."""
+    middle = len(rate) // 2
+    if middle < _LEAST_HALF:
+        return
+    shifts = []
+    for half in (slice(None, middle), slice(middle, None)):
+        coarse, correlation = _coarse_shift(start[half], stop[half], rate[half], integral)
+        if correlation < _LEAST_CORRELATION:
+            return  # a half that tells nothing by itself
+        shift, unexplained = _fine_shift(start[half], stop[half], rate[half], integral, coarse)
+        if unexplained > _CLEARLY_EXPLAINED:
+            return
+        shifts.append(shift)
+    if abs(shifts[1] - shifts[0]) > _LARGEST_JUMP_S:
+        raise CalibrationError(
+            f"{name}: its clock and the IMU's do not run together: the time offset is {shifts[0]:.4f} s in the first "
+            f"half of the frames (up to {start[middle]:.1f} s after the IMU's first sample) and {shifts[1]:.4f} s in "
+            "the second. A clock jumped or drifts, or samples were lost and the others numbered on. Take the time "
+            "stamps from the sensors' own clocks, or calibrate from the part of the recording before the jump."
+        )
 
 
 def turning(track: CameraTrack, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ from simulated_truth import (
     errors,
     errors_in_sigmas,
     mean_square_distance,
+    only_frames,
     perturbation,
     perturbed,
 )
@@ -24,6 +25,8 @@ from jaxcal import (
     load_calibration,
 )
 from jaxcal.simulation import SimulatedRig, paper_rig, simulate_detections, simulate_imu
+
+Recording = tuple[list[Detections], ImuRecording]
 
 NOISE_PX = 0.15
 # Fixed, so that all tests here share their compiled programs.
@@ -105,6 +108,24 @@ def test_the_trajectory_and_the_biases_are_those_of_the_rig(rig: SimulatedRig, c
     assert imu.accel_bias_std is not None
     assert np.all(np.abs(imu.gyro_bias[0] - rig.gyro_bias) < 4.0 * imu.gyro_bias_std[0] + 1e-5)
     assert np.all(np.abs(imu.accel_bias[0] - rig.accel_bias) < 4.0 * imu.accel_bias_std[0] + 1e-3)
+
+
+@pytest.mark.slow
+def test_gaps_and_lost_frames_cost_precision_not_truth(rig: SimulatedRig, recording: Recording) -> None:
+    """The IMU is silent for half a second, a camera for another, and every third of its frames is lost."""
+    detections, imu = recording
+    seconds = (imu.timestamps_ns - imu.timestamps_ns[0]) * 1e-9
+    heard = (seconds < 3.0) | (seconds > 3.5)
+    silent = ImuRecording(imu.timestamps_ns[heard], imu.gyro_rad_s[heard], imu.accel_m_s2[heard], imu.noise)
+    first = detections[0]
+    keep = np.arange(len(first.timestamps_ns))
+    since = (first.timestamps_ns - first.timestamps_ns[0]) * 1e-9
+    keep = keep[(keep % 3 != 0) & ((since < 5.0) | (since > 5.5))]
+    found = calibrate_camera_imu(
+        [only_frames(first, keep), detections[1]], silent, rig.target, knot_rate_hz=KNOT_RATE_HZ
+    )
+    assert found.converged
+    assert_within_sigmas(found, rig)
 
 
 @pytest.mark.slow
@@ -273,8 +294,6 @@ def test_saved_and_loaded_results_are_equal(calibrated: Calibration, tmp_path: P
 
 # --- what cannot be calibrated ---------------------------------------------------------------------------------------
 
-Recording = tuple[list[Detections], ImuRecording]
-
 
 def test_an_imu_recorded_at_another_time_is_refused(rig: SimulatedRig, recording: Recording) -> None:
     detections, imu = recording
@@ -298,6 +317,16 @@ def test_a_gyroscope_in_degrees_is_refused(rig: SimulatedRig, recording: Recordi
         CalibrationError, match=r"gyroscope turns 5\d\.\d times as fast as the camera. Is the gyroscope in rad/s"
     ):
         calibrate_camera_imu(detections, degrees, rig.target)
+
+
+@pytest.mark.parametrize("jump_s", [0.03, 0.4])
+def test_a_clock_that_jumps_is_named(rig: SimulatedRig, recording: Recording, jump_s: float) -> None:
+    detections, imu = recording
+    times = imu.timestamps_ns.copy()
+    times[len(times) // 2 :] += round(jump_s * 1e9)
+    jumped = dataclasses.replace(imu, timestamps_ns=times)
+    with pytest.raises(CalibrationError, match="cam0: its clock and the IMU's do not run together"):
+        calibrate_camera_imu(detections, jumped, rig.target)
 
 
 def test_a_camera_that_hardly_turns_is_refused(rig: SimulatedRig) -> None:
