@@ -21,10 +21,11 @@ _TRIM = 0.8
 _LEAST_CORRELATION = 0.4
 _LEAST_TURNING = 0.05
 # Offsets of the halves of a recording further apart than this are two offsets, where each half has so many frames and
-# its turning leaves so little unexplained (s; frames; share).
+# its turning leaves so little unexplained, by itself and beside what one offset leaves (s; frames; shares).
 _LARGEST_JUMP_S = 0.01
 _LEAST_HALF = 40
 _CLEARLY_EXPLAINED = 0.05
+_WORTH_TWO = 0.5
 # How many times faster than the camera the gyroscope may seem to turn, or slower.
 _LARGEST_SCALE = 2.0
 # The share of the gyroscope's variance that the camera's turning may leave unexplained. Real and simulated recordings
@@ -120,8 +121,8 @@ def align(track: CameraTrack, imu_time_s: np.ndarray, gyro: np.ndarray, name: st
             f"{_LARGEST_SHIFT_S:g} s apart, and is the gyroscope in rad/s?"
         )
     _check_scale(rate, integral.mean_rate(start + coarse, stop + coarse), name)
-    _check_clock(start, stop, rate, integral, name)
     shift, unexplained = _fine_shift(start, stop, rate, integral, coarse)
+    _check_clock(start, stop, rate, integral, name, unexplained)
     if unexplained > _LARGEST_UNEXPLAINED:
         raise CalibrationError(
             f"{name}: its turning does not match the IMU's: the best time offset ({shift:.3f} s) and rotation leave "
@@ -148,8 +149,11 @@ def _fine_shift(
     return shift, cost / float(np.nansum(np.nanvar(measured, axis=0)))
 
 
-def _check_clock(start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral, name: str) -> None:
-    """Raise CalibrationError when the offset that serves the first half of the recording is not that of the second."""
+def _check_clock(
+    start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral, name: str, left: float = np.inf
+) -> None:
+    """Raise CalibrationError when the offset that serves the first half of the recording is not that of the second, and
+    one offset for both leaves clearly more unexplained (`left`) than two do."""
     middle = len(rate) // 2
     if middle < _LEAST_HALF:
         return
@@ -159,7 +163,7 @@ def _check_clock(start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral
         if correlation < _LEAST_CORRELATION:
             return  # a half that tells nothing by itself
         shift, unexplained = _fine_shift(start[half], stop[half], rate[half], integral, coarse)
-        if unexplained > _CLEARLY_EXPLAINED:
+        if unexplained > min(_CLEARLY_EXPLAINED, _WORTH_TWO * left):
             return
         shifts.append(shift)
     if abs(shifts[1] - shifts[0]) > _LARGEST_JUMP_S:

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal import Calibration, Detections
 from jaxcal.cameras import CameraModel, PinholeEquidistant
-from jaxcal.simulation import SimulatedCamera, SimulatedRig, paper_rig, simulate_detections
+from jaxcal.simulation import SimulatedRig, paper_rig, simulate_detections
+from jaxcal.studies.truth import errors, in_sigmas, normalised_square
 
 # Every camera-only test uses this many frames per camera, so that few programs are compiled.
 FRAMES = 32
@@ -55,12 +56,6 @@ def first_frames(detections: Detections, count: int) -> Detections:
     return only_frames(detections, detections.seen_frames[:count])
 
 
-def perturbation(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """(6,) rotation vector on the left and translation that take a transform `truth` to `estimate`."""
-    turn = Rotation.from_matrix(estimate[:3, :3] @ truth[:3, :3].T).as_rotvec()
-    return np.concatenate([turn, estimate[:3, 3] - truth[:3, 3]])
-
-
 def perturbed(transform: np.ndarray, step: np.ndarray) -> np.ndarray:
     """The transform moved by (6,) a rotation vector on the left and a translation; `perturbation` undoes it."""
     moved = transform.copy()
@@ -69,47 +64,15 @@ def perturbed(transform: np.ndarray, step: np.ndarray) -> np.ndarray:
     return moved
 
 
-def errors(calibration: Calibration, rig: SimulatedRig) -> dict[str, np.ndarray]:
-    """Estimate minus truth of every block of the calibration's covariance, in that block's coordinates; of cameras and
-    gravity alone."""
-    found: dict[str, np.ndarray] = {}
-    previous: SimulatedCamera | None = None
-    for camera, truth in zip(calibration.cameras, rig.cameras, strict=True):
-        found[f"{camera.name}.intrinsics"] = np.asarray(camera.model.intrinsics - truth.model.intrinsics)
-        found[f"{camera.name}.distortion"] = np.asarray(camera.model.distortion - truth.model.distortion)
-        if previous is not None and camera.T_cn_cnm1 is not None:
-            relative = truth.T_cam_imu @ np.linalg.inv(previous.T_cam_imu)
-            found[f"{camera.name}.T_cn_cnm1"] = perturbation(camera.T_cn_cnm1, relative)
-        if camera.T_cam_imu is not None and camera.timeshift_cam_imu is not None:
-            found[f"{camera.name}.T_cam_imu"] = perturbation(camera.T_cam_imu, truth.T_cam_imu)
-            shift = camera.timeshift_cam_imu - truth.timeshift_cam_imu
-            found[f"{camera.name}.timeshift_cam_imu"] = np.array([shift])
-        previous = truth
-    if calibration.gravity is not None:
-        found["gravity"] = calibration.gravity - rig.gravity
-    return {
-        name: found[name]
-        for name, _ in calibration.blocks
-        if not name.startswith("imu") and not name.endswith("line_delay")
-    }
-
-
 def errors_in_sigmas(calibration: Calibration, rig: SimulatedRig) -> np.ndarray:
     """Every estimated number's error over its 1-sigma."""
-    found = errors(calibration, rig)
-    return np.concatenate([error / calibration.std(name) for name, error in found.items()])
+    return in_sigmas(calibration, errors(calibration, rig))
 
 
 def mean_square_distance(calibration: Calibration, rig: SimulatedRig) -> float:
     """Mahalanobis distance of the truth squared, per degree of freedom: 1 on average if the covariance is right."""
-    found = errors(calibration, rig)
-    error, covariance = np.concatenate(list(found.values())), calibration.covariance_of(*found)
-    sigma = np.sqrt(np.diag(covariance))
-    free = sigma > 0
-    values, vectors = np.linalg.eigh((covariance / np.outer(sigma, sigma))[np.ix_(free, free)])
-    # Left out: relative poses of cameras repeat what T_cam_imu says, and gravity's length is known.
-    known = values > 1e-8 * values.max()
-    return float(np.mean((vectors.T @ (error[free] / sigma[free]))[known] ** 2 / values[known]))
+    square, freedom = normalised_square(calibration, errors(calibration, rig))
+    return square / freedom
 
 
 def assert_within_sigmas(calibration: Calibration, rig: SimulatedRig) -> None:

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 from simulated_truth import (
     assert_within_sigmas,
-    errors,
     errors_in_sigmas,
     mean_square_distance,
     only_frames,
-    perturbation,
     perturbed,
 )
 
@@ -25,6 +23,7 @@ from jaxcal import (
     load_calibration,
 )
 from jaxcal.simulation import SimulatedRig, paper_rig, simulate_detections, simulate_imu
+from jaxcal.studies.truth import errors, perturbation
 
 Recording = tuple[list[Detections], ImuRecording]
 

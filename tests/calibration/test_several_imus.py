@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated_truth import errors_in_sigmas, perturbation
+from simulated_truth import errors_in_sigmas
 
 from jaxcal import Calibration, CalibrationError, calibrate_camera_imu
 from jaxcal.imu import imu_model
 from jaxcal.simulation import ImuTruth, SimulatedRig, paper_rig, simulate_detections, simulate_imu
+from jaxcal.studies.truth import errors, in_sigmas
 
 SECOND = np.eye(4)
 SECOND[:3, :3] = Rotation.from_rotvec([0.3, -1.2, 0.4]).as_matrix()
@@ -52,35 +53,13 @@ def calibrated(rig: SimulatedRig, truths: tuple[ImuTruth, ImuTruth]) -> Calibrat
     )
 
 
-def imu_errors_in_sigmas(calibration: Calibration, truths: tuple[ImuTruth, ...]) -> np.ndarray:
-    ratios = []
-    for number, (imu, truth) in enumerate(zip(calibration.imus, truths, strict=True)):
-        true = imu_model(truth.model).matrices(unusual(truth.model))
-        for block, entries in imu_model(truth.model).blocks:
-            found, expected = imu.parameters[block], true[block]
-            if block.startswith("M_"):
-                error = (found - expected)[np.tril_indices(3)]
-            elif block == "C_gyro_i":
-                error = Rotation.from_matrix(found @ expected.T).as_rotvec()
-            else:
-                error = np.ravel(found - expected)
-            assert len(error) == len(entries)
-            ratios.append(error / calibration.std(f"imu{number}.{block}"))
-        if number:
-            assert imu.T_imu_imu0 is not None
-            assert imu.timeshift_imu_imu0 is not None
-            pose = perturbation(imu.T_imu_imu0, truth.T_imu_imu0) / calibration.std(f"imu{number}.T_imu_imu0")
-            clock = imu.timeshift_imu_imu0 - truth.timeshift_imu_imu0
-            ratios += [pose, clock / calibration.std(f"imu{number}.timeshift_imu_imu0")]
-    return np.concatenate(ratios)
-
-
 @pytest.mark.slow
 def test_parameters_places_and_clocks_are_recovered_within_their_sigmas(
     rig: SimulatedRig, truths: tuple[ImuTruth, ImuTruth], calibrated: Calibration
 ) -> None:
     assert calibrated.converged
-    imu = imu_errors_in_sigmas(calibrated, truths)
+    found = errors(calibrated, rig, truths)
+    imu = in_sigmas(calibrated, {name: error for name, error in found.items() if name.startswith("imu")})
     assert np.mean(np.abs(imu) < 3.5) >= 0.97, imu
     assert 0.5 < np.sqrt(np.mean(imu**2)) < 1.6
     first, second = calibrated.imus
