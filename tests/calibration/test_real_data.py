@@ -153,7 +153,7 @@ def test_kalibrs_own_corners_give_at_most_kalibrs_errors(data_folder: Path) -> N
     assert abs(shift) < 10e-6
     # Kalibr's own: (-0.004, -0.003, -0.047, -0.053) px, and (-2.2e-4, 2.0e-4, 2e-5, 2e-5).
     assert np.linalg.norm(np.asarray(camera.model.intrinsics) - truth["intrinsics"]) < 0.0710
-    distortion = np.asarray(camera.model.distortion) - truth["distortion"]
+    distortion = np.asarray(camera.model.distortion) - truth["distortion_coeffs"]
     assert (np.abs(distortion) < [2.2e-4, 2.0e-4, 2e-5, 2e-5]).all()
     assert calibration.converged
 
