@@ -87,8 +87,9 @@ def _border(
 ) -> Float[Array, "K B P"]:
     """Products of chain and shared coordinates."""
     gravity = layout.gravity_size
-    first, *others = crosses = [chain_from_windows(imu.cross) for imu in imus]
-    pulled = sum((cross[..., -gravity:] for cross in others), start=first[..., -gravity:])
+    crosses = [chain_from_windows(imu.cross) for imu in imus]
+    # Without an IMU (a rolling shutter alone needs a trajectory, too) gravity is held.
+    pulled = sum((cross[..., -gravity:] for cross in crosses), start=jnp.zeros((blocks, 6, gravity)))
     own = (cross[..., :-gravity] for cross in crosses)
     rows = [jnp.concatenate([corners.cameras, *own, pulled, corners.others], axis=-1)]
     for i, imu in enumerate(imus):

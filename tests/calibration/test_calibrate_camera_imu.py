@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -287,8 +288,17 @@ def test_saved_and_loaded_results_are_equal(calibrated: Calibration, tmp_path: P
         assert after.reprojection_rms_px == before.reprojection_rms_px
     assert loaded.imu is not None
     assert calibrated.imu is not None
-    for field in dataclasses.fields(loaded.imu):
-        np.testing.assert_array_equal(getattr(loaded.imu, field.name), getattr(calibrated.imu, field.name))
+    assert_fields_equal(loaded.imu, calibrated.imu)
+
+
+def assert_fields_equal(one: Any, other: Any) -> None:
+    """All fields of two data classes, of those within them too."""
+    for field in dataclasses.fields(one):
+        mine, theirs = getattr(one, field.name), getattr(other, field.name)
+        if dataclasses.is_dataclass(mine):
+            assert_fields_equal(mine, theirs)
+        else:
+            np.testing.assert_array_equal(mine, theirs)
 
 
 # --- what cannot be calibrated ---------------------------------------------------------------------------------------
