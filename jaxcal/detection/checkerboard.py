@@ -14,6 +14,7 @@ from jaxcal.targets import Checkerboard
 _FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE
 _MAX_HALF_WINDOW = 10
 _ENOUGH_ALTERNATE, _ENOUGH_ON_A_SIDE = 0.8, 0.5
+_CLEAR_GAP = 0.25  # between the two colours at a corner, of all contrast there
 _REACH = 0.4  # of the distance to the nearest corner
 
 
@@ -60,7 +61,9 @@ def _colours_alternate(image: np.ndarray, grid: np.ndarray) -> bool:
     squares = np.stack([grid + along + up, grid - along - up, grid + along - up, grid - along + up])
     grey = _grey_at(image, squares)
     one, other = grey[:2], grey[2:]
-    alternate = (one.max(axis=0) < other.min(axis=0)) | (one.min(axis=0) > other.max(axis=0))
+    # On the outline only one square of four is black: by chance the noisy whites lie either way, but not far apart.
+    gap = np.maximum(other.min(axis=0) - one.max(axis=0), one.min(axis=0) - other.max(axis=0))
+    alternate = gap > _CLEAR_GAP * np.ptp(grey, axis=0)
     sides = (alternate[0], alternate[-1], alternate[:, 0], alternate[:, -1])
     return bool(alternate.mean() > _ENOUGH_ALTERNATE and min(side.mean() for side in sides) > _ENOUGH_ON_A_SIDE)
 

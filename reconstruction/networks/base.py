@@ -15,7 +15,8 @@ class ReconstructionNetwork(nn.Module, abc.ABC):
 
     `num_bins` time bins of the voxel grid it reads; `multiple`: input height and width must be divisible by it;
     `settings`: the numbers and names it was built from, as they stand in a checkpoint; `reduced_precision`: whether
-    it was trained to work in bfloat16; `normalises`: whether it was trained on normalised voxel grids; `padding`: what
+    it was trained to work in bfloat16; `scaling` of the voxel grids that it was trained on: 'window' (each brought to
+    mean 0 and deviation 1, as E2VID's), 'running' (`reconstruction.voxel.RunningScale`) or 'none'; `padding`: what
     surrounds an input that is too small, 'reflect' or 'zeros'.
     """
 
@@ -23,12 +24,12 @@ class ReconstructionNetwork(nn.Module, abc.ABC):
     multiple: int
     settings: dict[str, Any]
     reduced_precision: bool = False
-    normalises: bool = True
+    scaling: str = "window"
     padding: str = "reflect"
 
     @abc.abstractmethod
     def forward(self, voxels: torch.Tensor, state: State | None) -> tuple[torch.Tensor, State]:
         """Image (B, 1, H, W), dark 0 to bright 1, at the end of the window, and the state for the next one.
 
-        `voxels` (B, num_bins, H, W) normalised voxel grids; `state` None at the start of a recording.
+        `voxels` (B, num_bins, H, W) scaled voxel grids; `state` None at the start of a recording.
         """

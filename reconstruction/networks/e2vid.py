@@ -122,7 +122,7 @@ class E2VIDRecurrent(ReconstructionNetwork):
         super().__init__()
         self.num_bins = int(num_bins)
         self.multiple = 2 ** int(num_encoders)
-        self.normalises = bool(normalise)
+        self.scaling = "window" if normalise else "none"
         self.padding = one_of("padding", padding, ("reflect", "zeros"))
         structure = {
             "num_bins": self.num_bins,
@@ -137,7 +137,7 @@ class E2VIDRecurrent(ReconstructionNetwork):
             "channel_multiplier": float(channel_multiplier),
             "final_activation": one_of("final_activation", final_activation or "none", tuple(_ACTIVATIONS)),
         }
-        self.settings = structure | {"normalise": self.normalises, "padding": self.padding}
+        self.settings = structure | {"normalise": bool(normalise), "padding": self.padding}
         self.unetrecurrent = UNet(**structure)
 
     def forward(self, voxels: torch.Tensor, state: State | None) -> tuple[torch.Tensor, State]:

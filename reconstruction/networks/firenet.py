@@ -101,7 +101,7 @@ class FireNet(ReconstructionNetwork):
         super().__init__()
         self.num_bins = int(num_bins)
         self.multiple = 2 ** int(num_encoders)
-        self.normalises = bool(normalise)
+        self.scaling = "window" if normalise else "none"
         self.padding = one_of("padding", padding, ("reflect", "zeros"))
         recurrent_residual = [0] if recurrent_blocks is None else list(recurrent_blocks.get("resblock", []))
         self.settings = {
@@ -115,7 +115,7 @@ class FireNet(ReconstructionNetwork):
             "kernel_size": int(kernel_size),
             "recurrent_kernel_size": int(recurrent_kernel_size),
             "recurrent_blocks": {"resblock": recurrent_residual},
-            "normalise": self.normalises,
+            "normalise": bool(normalise),
             "padding": self.padding,
         }
         self.net = FireBody(

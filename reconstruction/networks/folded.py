@@ -17,11 +17,14 @@ class FoldedFireNet(ReconstructionNetwork):
 
     reduced_precision = True
 
-    def __init__(self, *, num_bins: int = 5, channels: int = 32, fold: int = 2, **_ignored: Any):
+    def __init__(
+        self, *, num_bins: int = 5, channels: int = 32, fold: int = 2, scaling: str = "window", **_ignored: Any
+    ):
         super().__init__()
         self.num_bins = int(num_bins)
         self.multiple = int(fold)
-        self.settings = {"num_bins": self.num_bins, "channels": int(channels), "fold": int(fold)}
+        self.scaling = scaling
+        self.settings = {"num_bins": self.num_bins, "channels": int(channels), "fold": int(fold), "scaling": scaling}
         self.body = FireBody(
             self.num_bins * self.multiple**2,
             self.multiple**2,

@@ -1,4 +1,10 @@
-"""The command `python -m reconstruction.training`: simulate, train, evaluate, export weights and model card."""
+"""The command `python -m reconstruction.training`: simulate, train, evaluate, export weights and model card.
+
+    python -m reconstruction.training --output models/                      # the shipped weights, from nothing
+    python -m reconstruction.training --output out/ --name patterns_v2 --parent models/patterns_v1.safetensors
+
+An interrupted run goes on where it stopped.
+"""
 
 import argparse
 import logging
@@ -8,10 +14,12 @@ import cv2
 import torch
 from tqdm import tqdm
 
-from reconstruction.checkpoints import DEFAULT_NETWORK
+from jaxcal.progress import Progress
+from reconstruction.checkpoints import DEFAULT_NETWORK, load_network, save_network
+from reconstruction.networks import ReconstructionNetwork
 from reconstruction.training.data import load_or_generate
-from reconstruction.training.loop import train
-from reconstruction.training.recipe import Recipe
+from reconstruction.training.loop import Run, train
+from reconstruction.training.recipe import RECIPES, Recipe
 
 
 class _Bars:
@@ -30,9 +38,16 @@ class _Bars:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m reconstruction.training", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m reconstruction.training",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--output", type=Path, required=True, help="folder for the weights and the model card")
-    parser.add_argument("--name", default=DEFAULT_NETWORK, help="name of the network (default: %(default)s)")
+    parser.add_argument(
+        "--name", default=DEFAULT_NETWORK, choices=RECIPES, help="which recipe; the network's name (%(default)s)"
+    )
+    parser.add_argument("--parent", type=Path, help="weights to start from, in place of training the recipe's parent")
     parser.add_argument("--cache", type=Path, help="folder for sequences and checkpoints (default: OUTPUT/.cache)")
     parser.add_argument(
         "--threads",
@@ -45,12 +60,26 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(arguments.threads)
     cache = arguments.cache or arguments.output / ".cache"
-    recipe, bars = Recipe(), _Bars()
-    dataset = load_or_generate(recipe.data, recipe.num_bins, cache, bars)
-    network, seconds = train(recipe, dataset, cache / f"{arguments.name}.checkpoint.pt", progress=bars)
+    recipe, bars = RECIPES[arguments.name], _Bars()
+    run = trained(arguments.name, recipe, cache, arguments.parent, bars)
     from reconstruction.training.export import evaluate_and_export
 
-    evaluate_and_export(network, recipe, seconds, arguments.output / f"{arguments.name}.safetensors", progress=bars)
+    evaluate_and_export(run, recipe, arguments.output / f"{arguments.name}.safetensors", progress=bars)
+
+
+def trained(name: str, recipe: Recipe, cache: Path, parent: Path | None, progress: Progress) -> Run:
+    """The training of a recipe, after its parent's unless the parent's weights are given."""
+    start: ReconstructionNetwork | None = None
+    if parent is not None:
+        start = load_network(parent)
+    elif recipe.parent is not None:
+        # Through a file, as it is shipped: the weights in it are rounded.
+        parent = cache / f"{name}.parent.safetensors"
+        if not parent.exists():
+            save_network(trained(f"{name}.parent", recipe.parent, cache, None, progress).average, parent)
+        start = load_network(parent)
+    dataset = load_or_generate(recipe.data, recipe.num_bins, cache, progress)
+    return train(recipe, dataset, cache / f"{name}.checkpoint.pt", parent=start, progress=progress)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxcal.progress import Progress, no_progress, track
 from reconstruction.training.recipe import DataRecipe, Stage, fingerprint
 from reconstruction.training.sequences import training_scene, windows
-from reconstruction.voxel import voxel_grid
+from reconstruction.voxel import RunningScale, accumulate, normalise
 
 logger = logging.getLogger(__name__)
 
@@ -67,14 +67,14 @@ def load_or_generate(recipe: DataRecipe, num_bins: int, cache: Path, progress: P
 
 def _generate(recipe: DataRecipe, num_bins: int, index: int, path: Path) -> None:
     rng = np.random.default_rng([recipe.seed, index])
-    scene = training_scene(rng, recipe.size, recipe.windows, recipe.checkerboards)
+    scene = training_scene(rng, recipe)
+    scaled = RunningScale() if recipe.scaling == "running" else normalise
     voxels, targets = [], []
     for window in windows(scene, seed=index):
-        voxels.append(
-            voxel_grid(
-                window.x, window.y, window.t_us, window.p, width=recipe.size, height=recipe.size, num_bins=num_bins
-            )
+        grid = accumulate(
+            window.x, window.y, window.t_us, window.p, width=recipe.size, height=recipe.size, num_bins=num_bins
         )
+        voxels.append(scaled(grid))
         targets.append(window.target)
     partial = path.with_suffix(".part")
     with partial.open("wb") as file:

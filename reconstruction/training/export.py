@@ -1,43 +1,46 @@
-"""The trained network as a file that is shipped, with a model card whose numbers were measured on that file."""
+"""The trained network as a file that is shipped, with a model card whose numbers and curves belong to that file."""
 
 import hashlib
 import itertools
 import os
 from pathlib import Path
 
+import numpy as np
+
 from jaxcal.progress import Progress, no_progress
 from reconstruction.checkpoints import load_network, save_network
-from reconstruction.networks import FoldedFireNet
+from reconstruction.networks import ReconstructionNetwork
 from reconstruction.training.evaluate import CornerErrors, Evaluation, evaluate
+from reconstruction.training.loop import HISTORY_STEPS, Run
 from reconstruction.training.recipe import Recipe, fingerprint
 
 LICENCE = "Apache-2.0"
 _SPEED_BINS = (0.0, 1.0, 3.0, 6.0, 10.0, 15.0, 25.0)  # pixels per window
 
 
-def evaluate_and_export(
-    network: FoldedFireNet, recipe: Recipe, seconds: float, path: Path, progress: Progress = no_progress
-) -> Evaluation:
-    """Write `path` (float16 safetensors), evaluate what stands there, and write the model card beside it."""
+def evaluate_and_export(run: Run, recipe: Recipe, path: Path, progress: Progress = no_progress) -> Evaluation:
+    """Write `path` (float16 safetensors), evaluate what stands there, and write card and curves beside it."""
     save_network(
-        network,
+        run.average,
         path,
         name=path.stem,
         licence=LICENCE,
         recipe=recipe.describe(),
-        data="simulated checkerboards and AprilGrids; no recordings",
+        data="simulated calibration boards; no recordings",
     )
     evaluation = evaluate(load_network(path), progress=progress)
+    _draw_curves(run, evaluation, path.with_suffix(".svg"))
     card = path.with_suffix(".md")
     partial = card.with_suffix(".part")
-    partial.write_text(model_card(path, network, recipe, seconds, evaluation), encoding="utf-8")
+    partial.write_text(model_card(path, run, recipe, evaluation), encoding="utf-8")
     os.replace(partial, card)
     return evaluation
 
 
-def model_card(path: Path, network: FoldedFireNet, recipe: Recipe, seconds: float, evaluation: Evaluation) -> str:
+def model_card(path: Path, run: Run, recipe: Recipe, evaluation: Evaluation) -> str:
     """Markdown: what the network is, what it was trained on and how, what it reaches, its licence and checksum."""
-    data, parameters = recipe.data, sum(tensor.numel() for tensor in network.parameters())
+    network, data = run.average, recipe.data
+    parameters = sum(tensor.numel() for tensor in network.parameters())
     reconstructed, sharp = evaluation.reconstructed, evaluation.sharp
     stages = "\n".join(
         f"- {stage.crop}x{stage.crop} crops, batch {stage.batch}: {stage.clips} clips of {stage.segments} x "
@@ -54,27 +57,29 @@ Reconstructs grey images of calibration boards from events. `reconstruction.load
 | sha256 | `{hashlib.sha256(path.read_bytes()).hexdigest()}` |
 | licence | {LICENCE} |
 | architecture | {type(network).__name__}, {parameters} parameters: {_settings(network)} |
-| input | normalised voxel grid of a window of 10 to 50 ms, {recipe.num_bins} time bins, any sensor size |
+| input | {_input(recipe)}, any sensor size |
 | output | linear intensity at the END of the window; the board's black is at 0.05, its white at 0.95 |
 
-It knows boards (checkerboards, AprilGrids) before cluttered backgrounds, and nothing else: it is not for pictures of
-the world.
+It knows calibration boards before cluttered backgrounds, and nothing else: it is not for pictures of the world.
 
 ## Data
 
 {data.sequences} simulated sequences of {data.windows} windows on {data.size}x{data.size} pixels,
-{100 * data.checkerboards:.0f} % checkerboards and the rest AprilGrids, in perspective, at tilts of up to 50 degrees,
-with white margins, uneven light and random backgrounds. Image motion of 0.4 to 25 pixels per window, with pauses. Event
-sensor (ESIM model): contrast thresholds 0.1 to 0.5 (log-uniform), ON and OFF up to a factor 1.5 apart, 1 to 15 %
-mismatch from pixel to pixel, refractory time 1 us to 0.5 ms, noise 0.01 to 3 Hz, leak up to 0.3 Hz, some hot pixels.
+{100 * data.checkerboards:.0f} % checkerboards, {100 * data.others:.0f} % circle grids and ChArUco boards, the rest
+AprilGrids with bits of {data.smallest_bit_px:g} to 7 pixels, in perspective, at tilts of up to
+{data.largest_tilt_deg:g} degrees, with white margins, uneven light and random backgrounds. Image motion of 0.4 to 25
+pixels per window, with pauses. Event sensor (ESIM model): contrast thresholds 0.1 to 0.5 (log-uniform), ON and OFF
+up to a factor 1.5 apart, 1 to 15 % mismatch from pixel to pixel, refractory time 1 us to 0.5 ms, noise 0.01 to 3 Hz,
+leak up to 0.3 Hz, some hot pixels.
 No recordings, no third-party images.
 
 ## Recipe
 
-`python -m reconstruction.training --output models/`, {seconds / 60:.0f} minutes of training with one thread
-on a shared machine with two CPU cores.
-Loss: L1 of the image + {recipe.gradient_weight} x L1 of its differences. AdamW {recipe.learning_rate}, linear decay to
-zero, gradient norm clipped at {recipe.clip_norm}, weights averaged (decay {recipe.average_decay}); bfloat16.
+`python -m reconstruction.training --output models/ --name {path.stem}`, {run.seconds / 60:.0f} minutes of training with
+one thread on a shared machine with two CPU cores{_after_parent(recipe)}.
+Loss: {_loss(recipe)}.
+AdamW {recipe.learning_rate:g}, falling to zero over the last {100 * recipe.falling_share:.0f} % of the steps, gradient
+norm clipped at {recipe.clip_norm}, weights averaged (decay {recipe.average_decay}); {recipe.precision}.
 
 {stages}
 
@@ -97,10 +102,50 @@ Detection ratio {evaluation.detection_ratio:.3f}. By speed of the corner:
 | pixels per window | corners | RMS (px) | mean error along the motion (px) | latency (ms) |
 |---|---|---|---|---|
 {_speed_rows(reconstructed)}
+
+![loss over the steps, and corner error over the speed]({path.stem}.svg)
 """
 
 
-def _settings(network: FoldedFireNet) -> str:
+def _input(recipe: Recipe) -> str:
+    grid = {
+        "window": "normalised voxel grid (E2VID)",
+        "running": "voxel grid in units of a passing edge's events (`RunningScale`)",
+    }[recipe.data.scaling]
+    return f"{grid} of a window of 10 to {recipe.data.longest_window_ms:g} ms, {recipe.num_bins} time bins"
+
+
+def _after_parent(recipe: Recipe) -> str:
+    if recipe.parent is None:
+        return ""
+    return f", after the {recipe.parent.steps} steps of its parent's recipe ({fingerprint(recipe.parent)})"
+
+
+def _loss(recipe: Recipe) -> str:
+    text = f"L1 of the image + {recipe.gradient_weight} x L1 of its differences"
+    if recipe.displacement_weight > 0:
+        text += f" + {recipe.displacement_weight} x displacement of corners (px)"
+    return text
+
+
+def _draw_curves(run: Run, evaluation: Evaluation, path: Path) -> None:
+    """The training loss, and the error of the reconstructed corners by speed, as an svg."""
+    from matplotlib.figure import Figure  # slow to import
+
+    figure = Figure(figsize=(8.0, 3.0), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.plot(HISTORY_STEPS * np.arange(1, len(run.history) + 1), run.history)
+    left.set(xlabel="step", ylabel="loss")
+    errors = evaluation.reconstructed
+    parts = [errors.moving(*pair) for pair in itertools.pairwise(_SPEED_BINS)]
+    right.stairs([part.rms_px for part in parts], _SPEED_BINS)
+    right.set(xlabel="pixels per window", ylabel="RMS of the corner error (px)", ylim=(0.0, None))
+    partial = path.with_suffix(".part")
+    figure.savefig(partial, format="svg", metadata={"Date": None})
+    os.replace(partial, path)
+
+
+def _settings(network: ReconstructionNetwork) -> str:
     return ", ".join(f"{name} {value}" for name, value in network.settings.items())
 
 

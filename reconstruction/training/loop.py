@@ -4,7 +4,8 @@ import copy
 import logging
 import os
 import time
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,13 @@ import torch
 from jaxtyping import Float
 
 from jaxcal.progress import Progress, no_progress
-from reconstruction.networks import FoldedFireNet
+from reconstruction.networks import FoldedFireNet, ReconstructionNetwork
 from reconstruction.networks.base import State
 from reconstruction.training.data import Dataset
+from reconstruction.training.losses import displacement_loss, image_loss
 from reconstruction.training.recipe import Recipe, Stage, fingerprint
+
+HISTORY_STEPS = 50
 
 logger = logging.getLogger(__name__)
 
@@ -31,7 +35,8 @@ class Run:
     stage: int = 0
     clip: int = 0
     seconds: float = 0.0
-    loss: float = float("nan")
+    loss: float = float("nan")  # smoothed over some 50 steps
+    history: list[float] = field(default_factory=list)  # `loss` after every HISTORY_STEPS steps
 
 
 def train(
@@ -39,15 +44,17 @@ def train(
     dataset: Dataset,
     checkpoint: Path,
     *,
+    parent: ReconstructionNetwork | None = None,
     checkpoint_every_s: float = 120.0,
     progress: Progress = no_progress,
-) -> tuple[FoldedFireNet, float]:
-    """The network with averaged weights, and the seconds that the training took over all its parts.
+) -> Run:
+    """The finished run: `average` is the network with averaged weights, in eval mode; `seconds` that it took in all.
 
-    Continues from `checkpoint` if one of the same recipe is there. Which clip comes when depends on the recipe's seed
-    and the clip's number only, so that an interrupted run ends as an uninterrupted one does.
+    Starts with the weights of `parent`, or at random. Continues from `checkpoint` if one of the same recipe
+    is there. Which clip comes when depends on the recipe's seed and the clip's number only, so that an interrupted run
+    ends as an uninterrupted one does.
     """
-    run = _start(recipe)
+    run = _start(recipe, parent)
     _resume(run, recipe, checkpoint)
     saved = begun = time.monotonic()
     before = run.seconds
@@ -64,13 +71,17 @@ def train(
                 logger.info("step %d of %d: loss %.4f, %.0f s", run.step, recipe.steps, run.loss, run.seconds)
         run.stage, run.clip = run.stage + 1, 0
     _save(run, recipe, checkpoint)
-    return run.average.eval(), run.seconds
+    run.average.eval()
+    return run
 
 
-def _start(recipe: Recipe) -> Run:
+def _start(recipe: Recipe, parent: ReconstructionNetwork | None = None) -> Run:
     torch.manual_seed(recipe.seed)
-    network = FoldedFireNet(num_bins=recipe.num_bins, channels=recipe.channels)
-    network = network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    network = FoldedFireNet(num_bins=recipe.num_bins, channels=recipe.channels, scaling=recipe.data.scaling)
+    if parent is not None:
+        network.load_state_dict(parent.state_dict())
+    if recipe.precision == "bfloat16":
+        network = network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay, betas=(0.9, 0.99)
     )
@@ -100,28 +111,26 @@ def _segment_loss(
 ) -> tuple[Float[torch.Tensor, ""], State]:
     """Mean loss over the windows after `warm_up`, and the state at the segment's end."""
     images = []
-    with torch.autocast("cpu", torch.bfloat16):
+    reduced = recipe.precision == "bfloat16"
+    precision: AbstractContextManager = torch.autocast("cpu", torch.bfloat16) if reduced else nullcontext()
+    layout = torch.channels_last if reduced else torch.contiguous_format
+    with precision:
         for grid in voxels:
-            image, state = network(grid.contiguous(memory_format=torch.channels_last), state)
+            image, state = network(grid.contiguous(memory_format=layout), state)
             images.append(image)
     assert state is not None
     predicted = torch.stack(images[warm_up:]).float()
-    return image_loss(predicted, targets[warm_up:], recipe.gradient_weight), state
-
-
-def image_loss(
-    predicted: Float[torch.Tensor, "*n h w"], target: Float[torch.Tensor, "*n h w"], gradient_weight: float
-) -> Float[torch.Tensor, ""]:
-    """L1 error of the image, plus that of its differences between neighbours along rows and columns."""
-    error = predicted - target
-    differences = error.diff(dim=-1).abs().mean() + error.diff(dim=-2).abs().mean()
-    return error.abs().mean() + gradient_weight * differences
+    loss = image_loss(predicted, targets[warm_up:], recipe.gradient_weight)
+    if recipe.displacement_weight > 0:
+        loss = loss + recipe.displacement_weight * displacement_loss(predicted, targets[warm_up:])
+    return loss, state
 
 
 def _optimise(run: Run, recipe: Recipe, loss: Float[torch.Tensor, ""]) -> None:
     rise = min(1.0, (run.step + 1) / recipe.warm_up_steps)
+    fall = min(1.0, (1.0 - run.step / recipe.steps) / recipe.falling_share)
     for group in run.optimiser.param_groups:
-        group["lr"] = recipe.learning_rate * rise * (1.0 - run.step / recipe.steps)
+        group["lr"] = recipe.learning_rate * rise * fall
     run.optimiser.zero_grad(set_to_none=True)
     loss.backward()
     torch.nn.utils.clip_grad_norm_(run.network.parameters(), recipe.clip_norm)
@@ -134,6 +143,8 @@ def _optimise(run: Run, recipe: Recipe, loss: Float[torch.Tensor, ""]) -> None:
     run.step += 1
     value = loss.item()
     run.loss = value if np.isnan(run.loss) else 0.98 * run.loss + 0.02 * value
+    if run.step % HISTORY_STEPS == 0:
+        run.history.append(run.loss)
 
 
 def _save(run: Run, recipe: Recipe, path: Path) -> None:
@@ -145,7 +156,7 @@ def _save(run: Run, recipe: Recipe, path: Path) -> None:
             "network": run.network.state_dict(),
             "average": run.average.state_dict(),
             "optimiser": run.optimiser.state_dict(),
-            "counters": {name: getattr(run, name) for name in ("step", "stage", "clip", "seconds", "loss")},
+            "counters": {name: getattr(run, name) for name in ("step", "stage", "clip", "seconds", "loss", "history")},
         },
         partial,
     )

@@ -58,6 +58,37 @@ def aprilgrid(rng: np.random.Generator, columns: int, rows: int, bit_texels: int
     return _placed(rng, board, np.array(corners) * float(bit_texels), None, margin, surround)
 
 
+def charuco(rng: np.random.Generator, columns: int, rows: int, cell_texels: int, surround: int) -> Pattern:
+    """A ChArUco board of `columns` x `rows` inner corners: a checkerboard with a marker in each white square."""
+    pattern = checkerboard(rng, columns, rows, cell_texels, surround)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
+    side = int(cell_texels * rng.uniform(0.6, 0.8))
+    inset = (cell_texels - side) // 2
+    left, top = (pattern.middle - pattern.extent / 2 + 0.5).astype(int)
+    for row in range(rows + 1):
+        for column in range(columns + 1):
+            if (row + column) % 2:  # white, as `checkerboard` colours it
+                marker = dictionary.generateImageMarker(int(rng.integers(250)), side)
+                y, x = top + row * cell_texels + inset, left + column * cell_texels + inset
+                pattern.texture[y : y + side, x : x + side] *= np.asarray(marker, dtype=np.float32) / 255.0
+    return pattern
+
+
+def circle_grid(rng: np.random.Generator, columns: int, rows: int, cell_texels: int, surround: int) -> Pattern:
+    """`columns` x `rows` black discs on white, in rows or in staggered rows; the corners are the discs' centres."""
+    staggered = rng.random() < 0.5
+    radius = int(cell_texels * rng.uniform(0.2, 0.35))
+    board = np.ones((rows * cell_texels, (columns + 1) * cell_texels), dtype=np.float32)
+    centres = [
+        (int((column + 0.5 + 0.5 * (staggered and row % 2)) * cell_texels), int((row + 0.5) * cell_texels))
+        for row in range(rows)
+        for column in range(columns)
+    ]
+    for centre in centres:
+        cv2.circle(board, centre, radius, 0.0, -1, cv2.LINE_AA)
+    return _placed(rng, board, np.array(centres) + 0.5, None, int(0.3 * cell_texels), surround)
+
+
 def _placed(
     rng: np.random.Generator,
     board: Float[np.ndarray, "h w"],

@@ -8,12 +8,24 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class DataRecipe:
-    """Simulated sequences: `sequences` of `windows` windows of a `size` x `size` crop, `checkerboards` their share."""
+    """Simulated sequences: `sequences` of `windows` windows of a `size` x `size` crop.
+
+    `checkerboards` is their share, `others` that of circle grids and ChArUco boards, the rest are AprilGrids with bits
+    of `smallest_bit_px` pixels or more. Boards are tilted by up to `largest_tilt_deg`, windows last 10 ms to
+    `longest_window_ms`. Scenes in which the board comes near to edge-on are kept only with `edge_on`. `scaling` of the
+    voxel grids as `ReconstructionNetwork.scaling`.
+    """
 
     sequences: int = 300
     windows: int = 48
     size: int = 96
     checkerboards: float = 0.6
+    others: float = 0.0
+    smallest_bit_px: float = 2.3
+    largest_tilt_deg: float = 50.0
+    longest_window_ms: float = 50.0
+    edge_on: bool = True
+    scaling: str = "window"
     seed: int = 2026
 
 
@@ -41,7 +53,12 @@ class Stage:
 
 @dataclass(frozen=True)
 class Recipe:
-    """All of it. `gradient_weight` multiplies the L1 error of the image's differences, beside that of the image."""
+    """All of it.
+
+    `gradient_weight` multiplies the L1 error of the image's differences, and `displacement_weight` the displacement of
+    corners in pixels, beside the L1 error of the image. The learning rate is held, and falls to zero over the last
+    `falling_share` of the steps. With a `parent`, training starts from the weights that the parent's recipe gives.
+    """
 
     data: DataRecipe = DataRecipe()
     stages: tuple[Stage, ...] = (
@@ -56,6 +73,10 @@ class Recipe:
     gradient_weight: float = 0.5
     clip_norm: float = 1.0
     average_decay: float = 0.998
+    displacement_weight: float = 0.0
+    falling_share: float = 1.0
+    precision: str = "bfloat16"
+    parent: "Recipe | None" = None
     seed: int = 1
 
     @property
@@ -70,3 +91,28 @@ class Recipe:
 def fingerprint(recipe: DataRecipe | Recipe) -> str:
     """Twelve hexadecimal digits that change with any setting."""
     return hashlib.sha256(json.dumps(dataclasses.asdict(recipe), sort_keys=True).encode()).hexdigest()[:12]
+
+
+PATTERNS_V1 = Recipe()
+# Counts in one unit, corners in the loss, more kinds of boards and smaller tags; continues from patterns_v1.
+# In the making: no weights of it are shipped yet.
+PATTERNS_V2 = Recipe(
+    data=DataRecipe(
+        sequences=300,
+        checkerboards=0.45,
+        others=0.1,
+        smallest_bit_px=1.8,
+        longest_window_ms=100.0,
+        edge_on=False,
+        scaling="running",
+        seed=2027,
+    ),
+    stages=(Stage(crop=80, windows=8, segments=5, batch=2, clips=1200),),
+    learning_rate=1e-3,
+    falling_share=0.4,
+    displacement_weight=0.3,
+    precision="float32",
+    parent=PATTERNS_V1,
+    seed=2,
+)
+RECIPES = {"patterns_v1": PATTERNS_V1, "patterns_v2": PATTERNS_V2}

@@ -10,12 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal.simulation.event_sensor import EventSensor, EventSensorConfig
 from reconstruction.training.motion import Path, View, apply_homography, speed_profile
-from reconstruction.training.patterns import Pattern, aprilgrid, checkerboard
+from reconstruction.training.patterns import Pattern, aprilgrid, charuco, checkerboard, circle_grid
+from reconstruction.training.recipe import DataRecipe
 
 # What the network's output means: the pattern's black and white, with room for overshoot in 8 bits.
 BLACK, WHITE = 0.05, 0.95
 
 _PIXELS_PER_STEP = 0.4  # largest image motion between two renderings
+_EDGE_ON = 0.3  # nearest over farthest depth of a plane in a crop: below this there is a horizon close by
 _SUPERSAMPLING = 3  # texels per pixel, and samples per pixel along each axis
 
 
@@ -58,14 +60,26 @@ class Scene:
     sensor: EventSensorConfig
 
 
-def training_scene(rng: np.random.Generator, size: int, windows: int, boards: float = 0.6) -> Scene:
-    """A random part of a random board that fills a `size` x `size` crop; `boards` the share of checkerboards."""
-    surround = size * _SUPERSAMPLING // 2
-    if rng.random() < boards:
+def training_scene(rng: np.random.Generator, recipe: DataRecipe) -> Scene:
+    """A random part of a random board that fills a crop, as the recipe says."""
+    while True:
+        scene = _any_training_scene(rng, recipe)
+        if recipe.edge_on or _least_foreshortening(scene) > _EDGE_ON:
+            return scene
+
+
+def _any_training_scene(rng: np.random.Generator, recipe: DataRecipe) -> Scene:
+    size, surround = recipe.size, recipe.size * _SUPERSAMPLING // 2
+    kind = rng.random()
+    if kind < recipe.checkerboards:
         cell = int(np.exp(rng.uniform(np.log(7), np.log(34))) * _SUPERSAMPLING)
         pattern = checkerboard(rng, int(rng.integers(4, 13)), int(rng.integers(3, 10)), cell, surround)
+    elif kind < recipe.checkerboards + recipe.others:
+        cell = int(np.exp(rng.uniform(np.log(9), np.log(34))) * _SUPERSAMPLING)
+        make = charuco if rng.random() < 0.5 else circle_grid
+        pattern = make(rng, int(rng.integers(4, 10)), int(rng.integers(3, 8)), cell, surround)
     else:
-        bit = int(np.exp(rng.uniform(np.log(2.3), np.log(7.0))) * _SUPERSAMPLING)
+        bit = int(np.exp(rng.uniform(np.log(recipe.smallest_bit_px), np.log(7.0))) * _SUPERSAMPLING)
         pattern = aprilgrid(rng, int(rng.integers(2, 5)), int(rng.integers(2, 5)), bit, surround)
     view = View(
         width=size,
@@ -74,10 +88,19 @@ def training_scene(rng: np.random.Generator, size: int, windows: int, boards: fl
         focal=rng.uniform(300, 900),
         offset=rng.uniform(-1, 1, 2) * (270, 190),
         look_at=pattern.middle + rng.uniform(-0.5, 0.5, 2) * pattern.extent,
-        tilt=_tilt(rng, 50.0),
+        tilt=_tilt(rng, recipe.largest_tilt_deg),
         amplitude=float(np.exp(rng.uniform(np.log(10), np.log(70)))),
     )
-    return _moving(rng, pattern, view, windows, top_speed=float(np.exp(rng.uniform(np.log(1.5), np.log(25)))))
+    top_speed = float(np.exp(rng.uniform(np.log(1.5), np.log(25))))
+    return _moving(rng, pattern, view, recipe.windows, top_speed=top_speed, longest_ms=recipe.longest_window_ms)
+
+
+def _least_foreshortening(scene: Scene) -> float:
+    """How far the image keeps from the horizon of the board's plane: 1 for a board seen head-on, 0 on the horizon."""
+    x, y = scene.view.width - 1, scene.view.height - 1
+    corners = np.array([[0, 0, 1.0], [x, 0, 1], [0, y, 1], [x, y, 1]])
+    depths = (np.linalg.inv(scene.path.homographies(scene.travelled)) @ corners.T)[:, 2]
+    return float((depths.min(axis=1) / np.abs(depths).max(axis=1)).min())
 
 
 def evaluation_scene(rng: np.random.Generator, windows: int, top_speed: float) -> Scene:
@@ -106,7 +129,14 @@ def _tilt(rng: np.random.Generator, largest_deg: float) -> Float[np.ndarray, "3"
 
 
 def _moving(
-    rng: np.random.Generator, pattern: Pattern, view: View, windows: int, *, top_speed: float, wobble: float = 1.0
+    rng: np.random.Generator,
+    pattern: Pattern,
+    view: View,
+    windows: int,
+    *,
+    top_speed: float,
+    wobble: float = 1.0,
+    longest_ms: float = 50.0,
 ) -> Scene:
     samples = 16
     travelled = speed_profile(rng, windows, top_speed, samples)
@@ -116,7 +146,7 @@ def _moving(
         path=Path(rng, view, float(travelled[-1]) + 1.0, wobble),
         travelled=travelled,
         samples=samples,
-        window_us=float(np.exp(rng.uniform(np.log(10_000), np.log(50_000)))),
+        window_us=float(np.exp(rng.uniform(np.log(10_000), np.log(1e3 * longest_ms)))),
         blur_px=rng.uniform(0.3, 1.0),
         black_to_white=float(np.exp(rng.uniform(np.log(0.03), np.log(0.15)))),
         sensor=random_sensor(rng),

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from jaxcal import Checkerboard
 from jaxcal.detection import find_corners
+from jaxcal.detection.checkerboard import _colours_alternate
 
 SIZE = (320, 240)
 BOARD = Checkerboard(rows=4, cols=5, spacing=0.06)
@@ -116,3 +117,24 @@ def test_no_board_no_corners(noise: float) -> None:
 def test_a_board_of_another_size_is_not_taken_for_this_one() -> None:
     point, _ = find_corners(view(BOARD, 0.0).image, Checkerboard(7, 8, spacing=0.06))
     assert len(point) == 0
+
+
+@pytest.mark.parametrize("shift", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_a_grid_one_row_off_is_refused_however_noisy_the_white_margin(shift: tuple[int, int]) -> None:
+    """As in event frames of boards partly out of view: the outline's corners in place of the missing row's.
+
+    There the margin is a little darker than the white squares, and never quite even.
+    """
+    board = BOARD.points[:, :2]
+    low, high = board.min(axis=0) - BOARD.spacing, board.max(axis=0) + BOARD.spacing
+    outline = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])[:, None]
+    for roll in np.linspace(-1.0, 1.0, 8):
+        drawn = view(BOARD, roll, (0.2, -0.3), noise=6)
+        to_pixel, _ = cv2.findHomography(board, drawn.pixels)
+        inside = np.zeros_like(drawn.image)
+        cv2.fillConvexPoly(inside, np.round(cv2.perspectiveTransform(outline, to_pixel)).astype(np.int32), 1)
+        image = np.where(inside > 0, drawn.image, (0.9 * drawn.image).astype(np.uint8))
+        for offset, expected in ((np.zeros(2), True), (BOARD.spacing * np.array(shift), False)):
+            moved = cv2.perspectiveTransform((board + offset)[:, None], to_pixel)
+            grid = np.asarray(moved).reshape(BOARD.rows, BOARD.cols, 2)
+            assert _colours_alternate(image, grid) == expected

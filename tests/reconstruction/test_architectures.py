@@ -128,7 +128,7 @@ def test_e2vid_plus_is_read(tmp_path: Path, activation: str, keys: dict[str, str
     save_plus(tmp_path / "plus.pth", network, "E2VIDRecurrent", arguments, **keys)
     loaded = reconstruction.load_network(tmp_path / "plus.pth")
     assert loaded.settings == network.settings
-    assert (loaded.normalises, loaded.padding) == (False, "zeros")
+    assert (loaded.scaling, loaded.padding) == ("none", "zeros")
     voxels = torch.randn(1, 5, 16, 16)
     assert torch.equal(loaded(voxels, None)[0], network(voxels, None)[0])
 

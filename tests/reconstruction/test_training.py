@@ -13,6 +13,7 @@ from reconstruction.networks import FoldedFireNet
 from reconstruction.training import loop
 from reconstruction.training.data import Dataset, load_or_generate
 from reconstruction.training.evaluate import CornerErrors, find_corners
+from reconstruction.training.losses import displacement_loss, image_loss
 from reconstruction.training.motion import apply_homography, speed_profile
 from reconstruction.training.recipe import DataRecipe, Recipe, Stage, fingerprint
 from reconstruction.training.sequences import BLACK, WHITE, evaluation_scene, training_scene, windows
@@ -35,8 +36,7 @@ def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 def _train(recipe: Recipe, dataset: Dataset, checkpoint: Path) -> dict[str, torch.Tensor]:
     torch.set_num_threads(1)
-    network, _ = loop.train(recipe, dataset, checkpoint, checkpoint_every_s=0.0)
-    return network.state_dict()
+    return loop.train(recipe, dataset, checkpoint, checkpoint_every_s=0.0).average.state_dict()
 
 
 def test_an_interrupted_training_ends_as_an_unbroken_one(
@@ -88,8 +88,8 @@ def test_training_reduces_the_loss_on_what_it_sees(tiny_dataset: Dataset, tmp_pa
             return loop._segment_loss(network, voxels, targets, None, 2, recipe)[0].item()
 
     before = loss(loop._start(recipe).network)
-    trained, _ = loop.train(recipe, tiny_dataset, tmp_path / "run.pt")
-    assert loss(trained) < 0.6 * before
+    trained = loop.train(recipe, tiny_dataset, tmp_path / "run.pt")
+    assert loss(trained.average) < 0.6 * before
 
 
 def test_data_are_generated_once_and_completed_after_an_interruption(tmp_path: Path, tiny_dataset: Dataset):
@@ -119,16 +119,51 @@ def test_fingerprint_changes_with_any_setting():
 def test_image_loss_is_zero_for_the_truth_and_counts_edges():
     target = torch.zeros(1, 4, 4)
     offset, stripes = torch.full((1, 4, 4), 0.1), 0.1 * (torch.arange(4) % 2 * 2.0 - 1).expand(1, 4, 4)
-    assert loop.image_loss(target, target, 0.5).item() == 0.0
-    assert loop.image_loss(target + offset, target, 0.5).item() == pytest.approx(0.1)
-    assert loop.image_loss(target + stripes, target, 0.5).item() == pytest.approx(0.1 + 0.5 * 0.2)
+    assert image_loss(target, target, 0.5).item() == 0.0
+    assert image_loss(target + offset, target, 0.5).item() == pytest.approx(0.1)
+    assert image_loss(target + stripes, target, 0.5).item() == pytest.approx(0.1 + 0.5 * 0.2)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
+def test_displacement_loss_measures_how_far_a_board_is_displaced(dx: float, dy: float):
+    board = np.kron(np.indices((6, 6)).sum(axis=0) % 2, np.ones((80, 80))).astype(np.float32)
+
+    def shown(shift: tuple[float, float]) -> torch.Tensor:
+        moved = cv2.warpAffine(
+            board, np.array([[1, 0, 8 * shift[0]], [0, 1, 8 * shift[1]]]), (480, 480), borderMode=cv2.BORDER_REPLICATE
+        )
+        blurred = cv2.GaussianBlur(moved, (0, 0), 5.6)
+        return torch.from_numpy(cv2.resize(blurred, (60, 60), interpolation=cv2.INTER_AREA))[None]
+
+    squared = (dx * dx + dy * dy) / 0.15**2
+    expected = 0.15 * (np.sqrt(1.0 + squared) - 1.0)
+    # A fifth of the lens' blur is where the first order in the displacement ends.
+    assert displacement_loss(shown((dx, dy)), shown((0.0, 0.0))).item() == pytest.approx(expected, rel=0.2, abs=1e-3)
+
+
+def test_displacement_loss_does_not_mind_wrong_grey_levels_without_edges():
+    target = torch.zeros(1, 30, 30)
+    assert displacement_loss(target + 0.3, target).item() == 0.0
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 10**6))
+def test_scenes_keep_from_the_horizon_where_asked_to(seed: int):
+    recipe = DataRecipe(size=40, windows=5, edge_on=False, others=0.4)
+    scene = training_scene(np.random.default_rng(seed), recipe)
+    x, y = np.meshgrid([0.0, 39.0], [0.0, 39.0])
+    pixels = np.stack([x, y, np.ones((2, 2))], axis=-1).reshape(-1, 3)
+    depth = np.linalg.inv(scene.path.homographies(scene.travelled))[:, 2] @ pixels.T
+    assert (depth.min(axis=1) > 0).all() or (depth.max(axis=1) < 0).all()
+    assert 0.0 <= scene.pattern.texture.min() <= scene.pattern.texture.max() <= 1.0
 
 
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 10**6))
 def test_no_point_of_the_image_moves_faster_than_the_path_says(seed: int):
     rng = np.random.default_rng(seed)
-    scene = training_scene(rng, 48, 6)
+    scene = training_scene(rng, DataRecipe(size=48, windows=6))
     travelled = np.linspace(0.0, float(scene.travelled[-1]), 300)
     homographies = scene.path.homographies(travelled)
     x, y = (values.ravel() for values in np.meshgrid(np.linspace(0, 47, 7), np.linspace(0, 47, 7)))
@@ -153,7 +188,7 @@ def test_speed_profile_keeps_to_its_top_speed_and_never_turns_back(seed: int, to
 @settings(deadline=None, max_examples=10)
 @given(st.integers(0, 10**6))
 def test_windows_hold_their_own_events_and_a_target_between_black_and_white(seed: int):
-    scene = training_scene(np.random.default_rng(seed), 40, 5)
+    scene = training_scene(np.random.default_rng(seed), DataRecipe(size=40, windows=5))
     sequence = list(windows(scene, seed))
     assert len(sequence) == 5
     for index, window in enumerate(sequence):

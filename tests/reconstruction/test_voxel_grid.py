@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from jaxcal.errors import CalibrationError
 from reconstruction import voxel_grid, voxel_torch
-from reconstruction.voxel import accumulate, normalise
+from reconstruction.voxel import RunningScale, accumulate, normalise
 
 WIDTH, HEIGHT = 7, 5
 SIZE = {"width": WIDTH, "height": HEIGHT}
@@ -153,3 +153,29 @@ def test_scatter_add_gives_the_same_grid_in_any_order(window: tuple[np.ndarray, 
     order = np.random.default_rng(seed).permutation(len(window[0]))
     assert torch.equal(voxel_torch.accumulate(*(values[order] for values in window), **size), grid)
     np.testing.assert_allclose(voxel_torch.normalise(grid), normalise(grid.numpy()), atol=1e-5)
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(1, 40), st.integers(0, 30), st.integers(0, 3), st.integers(0, 2**32 - 1))
+def test_running_scale_is_the_events_of_a_passing_edge(edge: int, noise: int, hot: int, seed: int):
+    """Whatever single noise events and a few hot pixels there are beside."""
+    rng = np.random.default_rng(seed)
+    net = np.zeros(4000)
+    net[:200] = edge * rng.choice([-1, 1], 200)
+    net[200 : 200 + noise] = 1
+    net[300 : 300 + hot] = 20 * edge
+    scale = RunningScale()
+    grid = scale(rng.permutation(net).reshape(1, 50, 80).astype(np.float32))
+    assert scale.events == edge
+    assert np.abs(grid).max() == pytest.approx(2.0 * (20 if hot else 1))
+
+
+def test_running_scale_outlasts_slow_windows_and_fades():
+    scale, fast, slow = RunningScale(), np.full((1, 4, 4), 20.0, np.float32), np.full((1, 4, 4), 3.0, np.float32)
+    scale(fast)
+    first = scale(slow)
+    assert np.allclose(first, 2.0 * 3.0 / (0.99 * 20.0))
+    for _ in range(1000):
+        last = scale(np.zeros((1, 4, 4), np.float32))
+    assert scale.events == 1.0
+    assert np.isfinite(last).all()
