@@ -8,9 +8,10 @@ lead by as much. Simulated checkerboards are reconstructed both ways up to the s
 with the truth: forwards, backwards, and the mean of the two. Nothing of jaxcal uses this; the shipped network was not
 trained on streams that run backwards.
 
-What it showed (4 scenes of 16 windows, patterns_v1): +0.23 ms forwards, +0.65 ms backwards, both behind the motion as it
-was; the mean trails by 0.44 ms. The lag is in the events (a pixel fires when its threshold is crossed, not before), and
-a network trained forwards makes up for a part of it, backwards in the wrong direction.
+What it showed (4 scenes of 16 windows, 28 boards, patterns_v1): corners trail by 0.23 ms forwards and by 0.65 ms
+backwards, both behind the true motion; their mean by 0.44 ms. It does not cancel. This suggests that the lag is in the
+events (a pixel fires after its threshold is crossed), that the network, trained forwards, makes up for a part of it,
+and does so in the wrong direction when time is turned round.
 """
 
 import argparse
