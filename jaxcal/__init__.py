@@ -36,6 +36,7 @@ _EXPORTS = {
     "detect": "jaxcal.detection",
     "calibrate_cameras": "jaxcal.calibration",
     "calibrate_camera_imu": "jaxcal.calibration",
+    "cross_validate": "jaxcal.calibration",
     "resolve": "jaxcal.calibration",
     "Calibration": "jaxcal.results",
     "load_calibration": "jaxcal.results",
@@ -48,7 +49,7 @@ _EXPORTS = {
 __all__ = [*sorted(_EXPORTS), "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import calibrate_camera_imu, calibrate_cameras, resolve
+    from jaxcal.calibration import calibrate_camera_imu, calibrate_cameras, cross_validate, resolve
     from jaxcal.cameras import CameraModel, camera_model
     from jaxcal.detection import detect
     from jaxcal.errors import CalibrationError

@@ -60,6 +60,18 @@ ALLOWED: dict[str, set[str]] = {
         "reconstruction",
     }
     | OBSERVATIONS,
+    # A study of recordings walks the corridor for each of them, and board and lenses are named in its file.
+    "jaxcal.studies": {
+        "jaxcal.calibration",
+        "jaxcal.cameras",
+        "jaxcal.estimation",
+        "jaxcal.pipeline",
+        "jaxcal.recording",
+        "jaxcal.results",
+        "jaxcal.simulation",
+        "jaxcal.targets",
+    }
+    | OBSERVATIONS,
     # The command may use every room.
     "jaxcal.cli": {"jaxcal", "reconstruction"},
     "reconstruction": OBSERVATIONS,

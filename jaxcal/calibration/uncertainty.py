@@ -109,6 +109,20 @@ def named_covariance(
     with_time: bool,
 ) -> tuple[tuple[tuple[str, int], ...], np.ndarray]:
     """Blocks and joint covariance of the parameters as `Calibration` names them, by linear propagation."""
+    blocks, jacobian = named_jacobian(names, layout, state, num_intrinsics, with_imu=with_imu, with_time=with_time)
+    return blocks, jacobian @ covariance @ jacobian.T
+
+
+def named_jacobian(
+    names: Sequence[str],
+    layout: SharedLayout,
+    state: RigState,
+    num_intrinsics: Sequence[int],
+    *,
+    with_imu: bool,
+    with_time: bool,
+) -> tuple[tuple[tuple[str, int], ...], np.ndarray]:
+    """The blocks of parameters as `Calibration` names them, and their derivative (n, P) by the shared vector."""
     blocks: list[tuple[str, int]] = []
     rows: list[np.ndarray] = []
     identity = np.eye(layout.size)
@@ -157,5 +171,4 @@ def named_covariance(
             blocks.append((f"target.{name}", size))
             rows.append(identity[start : start + size])
             start += size
-    jacobian = np.concatenate(rows)
-    return tuple(blocks), jacobian @ covariance @ jacobian.T
+    return tuple(blocks), np.concatenate(rows)

@@ -44,7 +44,7 @@ def held_back_residuals(
     for model, board, view in zip(models, boards, views, strict=True):
         rotation, translation, error = board_poses(model, board.frames, target)
         sightings.append(Sightings(view[board.row], board.board, (rotation, translation), error))
-    graph = _known_graph(calibration)
+    graph = known_graph(calibration)
     shape = calibration.target_shape
     layout = layout_of(
         models,
@@ -67,7 +67,7 @@ def held_back_residuals(
         layout=layout,
     )
     problem = eqx.tree_at(lambda p: p.free, problem, jnp.zeros(layout.size, dtype=bool))
-    state = eqx.tree_at(lambda s: s.target, state, _known_target(calibration))
+    state = eqx.tree_at(lambda s: s.target, state, known_target(calibration))
     result = solve(problem, state, max_steps=max_steps)
     errors = split_groups(layout, frames, [np.asarray(e) for e in corner_errors(problem, result.state)])
     return [
@@ -76,7 +76,8 @@ def held_back_residuals(
     ]
 
 
-def _known_graph(calibration: Calibration) -> RigGraph:
+def known_graph(calibration: Calibration) -> RigGraph:
+    """Places of cameras (T_cam_cam0) and boards (T_target_board) of a calibration."""
     places = [np.eye(4)]
     for camera in calibration.cameras[1:]:
         assert camera.T_cn_cnm1 is not None
@@ -86,14 +87,17 @@ def _known_graph(calibration: Calibration) -> RigGraph:
     return RigGraph((cameras[:, :3, :3], cameras[:, :3, 3]), (boards[:, :3, :3], boards[:, :3, 3]))
 
 
-def _known_target(calibration: Calibration) -> TargetState:
+def known_target(calibration: Calibration, warp: bool | None = None) -> TargetState:
+    """The target as a calibration found it to be; `warp` asks for a place for the bend (flat, where none was found)."""
     shape = calibration.target_shape
     boards = np.zeros((0, 4, 4)) if shape is None else shape.T_target_board[1:]
-    warp = None if shape is None else shape.warp_m
+    bend = None if shape is None else shape.warp_m
+    if warp is not None:
+        bend = (np.zeros(2) if bend is None else bend) if warp else None
     offsets = None if shape is None else shape.offsets_m
     return TargetState(
         R_target_board=jnp.asarray(boards[:, :3, :3]),
         t_target_board=jnp.asarray(boards[:, :3, 3]),
-        warp=jnp.zeros(0) if warp is None else jnp.asarray(warp),
+        warp=jnp.zeros(0) if bend is None else jnp.asarray(bend),
         offsets=jnp.zeros((0, 3)) if offsets is None else jnp.asarray(offsets),
     )

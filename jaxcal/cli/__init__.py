@@ -11,6 +11,7 @@ from jaxcal.cli.calibrate_imu_camera import calibrate_imu_camera
 from jaxcal.cli.compare import compare
 from jaxcal.cli.convert import convert
 from jaxcal.cli.convert_calibration import convert_calibration
+from jaxcal.cli.cross_validate import cross_validate
 from jaxcal.cli.detect import detect
 from jaxcal.cli.imu_noise import imu_noise
 from jaxcal.cli.info import info
@@ -18,6 +19,7 @@ from jaxcal.cli.init import init
 from jaxcal.cli.outcome import EXIT_CODES, IMPOSSIBLE
 from jaxcal.cli.reconstruct import reconstruct
 from jaxcal.cli.report import report
+from jaxcal.cli.study import study
 from jaxcal.cli.target import target
 from jaxcal.cli.validate import validate
 from jaxcal.errors import CalibrationError
@@ -104,4 +106,6 @@ main.add_command(calibrate_imu_camera)
 main.add_command(validate)
 main.add_command(compare)
 main.add_command(reconstruct)
+main.add_command(cross_validate)
 main.add_command(report)
+main.add_command(study)
