@@ -98,11 +98,22 @@ class StudyResult:
     def _centres(self) -> list[Mapping[str, Block]]:
         count = len(self.study.combinations)
         if self.reference is not None:
-            return [self.reference] * count
+            return [self._renamed(self.reference)] * count
         if self.study.kind in ("recordings", "sweep"):
             return [self._mean()] * count
         whole = {row["combination"]: self.blocks(row) for row in self.rows if row["run"] < 0}
         return [whole.get(number, {}) for number in range(count)]
+
+    def _renamed(self, reference: Mapping[str, Block]) -> Mapping[str, Block]:
+        """The reference with its cameras called as the runs call them; by order, where no name is in both (Kalibr's
+        files know cam0, cam1 and so on only)."""
+        runs = next((self.blocks(row) for row in self.rows if row["status"] == "ok"), {})
+        ours, theirs = _owners(runs), _owners(reference)
+        if set(ours) & set(theirs) or len(ours) != len(theirs):
+            return reference
+        name = dict(zip(theirs, ours, strict=True))
+        parts = {key: key.partition(".") for key in reference}
+        return {f"{name.get(owner, owner)}{dot}{rest}": reference[key] for key, (owner, dot, rest) in parts.items()}
 
     def _mean(self) -> dict[str, Block]:
         found: dict[str, list[Block]] = {}
@@ -167,3 +178,8 @@ class StudyResult:
             stated_sigma=stated,
             quantiles=tuple(np.quantile(deviations, _QUANTILES).tolist()),
         )
+
+
+def _owners(blocks: Mapping[str, Block]) -> list[str]:
+    """The cameras that blocks are of, in order."""
+    return [name.partition(".")[0] for name in blocks if name.endswith(".intrinsics")]
