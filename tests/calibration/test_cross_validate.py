@@ -43,7 +43,7 @@ def test_noise_alone_is_not_flagged(checked: CrossValidation) -> None:
 
 
 def test_with_other_noise_the_p_values_are_spread_evenly(sound: Calibration) -> None:
-    p_values = []
+    p_values, found = [], 0
     for run in range(24):
         (detections,), _ = renoised(sound, generator(5, run), None)
         known = known_problem(sound)
@@ -51,9 +51,11 @@ def test_with_other_noise_the_p_values_are_spread_evenly(sound: Calibration) -> 
         pixels = np.zeros((len(known.cameras[0].detections.timestamps_ns), known.kept[0].shape[1], 2))
         pixels[detections.frame, detections.point] = detections.pixels
         moved = known.with_pixels([pixels[known.cameras[0].frames]])
-        p_values += [evidence.p_value for evidence in find_model_errors(moved)]
+        tested = find_model_errors(moved)
+        p_values += [evidence.p_value for evidence in tested]
+        found += any(evidence.found for evidence in tested)
     assert np.mean(np.array(p_values) < 0.5) == pytest.approx(0.5, abs=0.15)
-    assert np.min(p_values) > 1e-4
+    assert found <= 1
 
 
 @pytest.mark.slow
@@ -63,7 +65,7 @@ def test_with_other_noise_the_p_values_are_spread_evenly(sound: Calibration) -> 
         ({"lens": RICH_LENS}, "lens", 1),
         ({"bend_m": 0.002}, "bent board", 1),
         ({"line_delay_s": 10e-6}, "rolling shutter", 1),
-        ({"late_lens": refocused(rig_for(0).cameras[0].model, 0.002)}, "changed lens", 1),  # pyright: ignore[reportArgumentType]
+        ({"late_lens": refocused(rig_for(0).cameras[0].model, 0.005)}, "changed lens", 1),  # pyright: ignore[reportArgumentType]
         ({"late_shift_m": 0.001}, "moved camera", 2),
     ],
 )
@@ -71,7 +73,7 @@ def test_every_error_is_flagged_by_its_name(error: dict[str, Any], cause: str, c
     found = cross_validate(calibrated(0, cameras, **error))
     assert found.flagged
     assert found.causes[0].cause == cause
-    assert found.causes[0].held_back > 100
+    assert found.causes[0].p_value < 1e-4
     if cause == "rolling shutter":
         assert found.causes[0].value == pytest.approx(10e-6, rel=0.15)
 
