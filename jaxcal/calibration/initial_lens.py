@@ -47,8 +47,6 @@ _LOST = 0.005
 _SUSPECT = 1.6
 _POSE_STEPS = 12
 _POSE_CHUNK = 256
-# Poses are sought on so many corners of a view, and settled on all of them.
-_POSE_CORNERS = 36
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,10 +115,7 @@ def board_poses(model: CameraModel, frames: CameraFrames, target: Target) -> tup
         for first in range(0, len(frames.frames), _POSE_CHUNK):
             part = slice(first, first + _POSE_CHUNK)
             views = compact_views(target.points, frames.pixels[part], frames.seen[part])
-            few = compact_views(target.points, frames.pixels[part], frames.seen[part], _POSE_CORNERS)
-            fit = _poses_from_rays(lens, parameters, *generic_lens.unproject(generic, few.pixels), few, far)
-            if few.weight.shape != views.weight.shape:
-                fit, _ = fit_poses(lens, fit, views, steps=2, width=_HUBER_PX, cap=0.25 * far)
+            fit = _poses_from_rays(lens, parameters, *generic_lens.unproject(generic, views.pixels), views, far)
             squared = squared_errors(lens, fit, views, far=1e6)[0]
             error = np.sqrt(np.sum(squared * views.weight, axis=1) / views.weight.sum(axis=1))
             parts.append((fit.rotation[0], views.to_target(fit.rotation[0], fit.translation[0]), error))
