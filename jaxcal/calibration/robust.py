@@ -15,7 +15,7 @@ from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.redundancy import Redundancy, measure_redundancy
 from jaxcal.calibration.state import RigState
 from jaxcal.errors import CalibrationError
-from jaxcal.estimation import SolveResult, solve
+from jaxcal.estimation import FIRST_DAMPING, SolveResult, solve
 from jaxcal.progress import Progress
 
 logger = logging.getLogger(__name__)
@@ -99,8 +99,13 @@ def robust_fit(
             basis = told_apart(problem.basis, result.equations, np.asarray(problem.free), layout)
             problem = eqx.tree_at(lambda p: p.basis, problem, basis, is_leaf=lambda leaf: leaf is None)
         last = stage == ROUNDS - 1
-        known = {} if result is None else {"damping": _NEXT_DAMPING}
-        result = solve(problem, state, max_steps=max_steps, rtol=0.0 if last else _ENOUGH_FOR_NOISE, **known)
+        result = solve(
+            problem,
+            state,
+            max_steps=max_steps,
+            rtol=0.0 if last else _ENOUGH_FOR_NOISE,
+            damping=FIRST_DAMPING if result is None else _NEXT_DAMPING,
+        )
         state = result.state
         errors = split_groups(layout, cameras, [np.asarray(e) for e in corner_errors(problem, state)])
         # In units of an ordinary corner: what a detector knows to be vague may err more.

@@ -14,10 +14,17 @@ from jaxcal.estimation.block_arrow import (
 from jaxcal.estimation.descent import BlockArrowDescent, BlockStep, damped_step
 from jaxcal.estimation.losses import LOSSES, Loss, barron, huber, robust_loss
 from jaxcal.estimation.problem import BlockArrowProblem, State
-from jaxcal.estimation.solver import BlockArrowLevenbergMarquardt, SolveResult, solve, solve_inside
+from jaxcal.estimation.solver import (
+    FIRST_DAMPING,
+    BlockArrowLevenbergMarquardt,
+    SolveResult,
+    solve,
+    solve_inside,
+)
 from jaxcal.estimation.threads import single_threaded_blas
 
 __all__ = [
+    "FIRST_DAMPING",
     "LOSSES",
     "BlockArrow",
     "BlockArrowDescent",

@@ -17,7 +17,7 @@ from jaxcal.estimation.problem import BlockArrowProblem, State
 from jaxcal.estimation.threads import single_threaded_blas
 
 _MAX_HISTORY = 256
-_FIRST_DAMPING = 1e-4
+FIRST_DAMPING = 1e-4
 _LARGEST_DAMPING = 1e14
 # Damping that holds back no direction that is determined at all: what still promises little under it is an optimum.
 _HARDLY_DAMPED = 1e-12
@@ -73,7 +73,7 @@ class BlockArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             trial=y,
             predicted=jnp.array(jnp.inf),
             equations=eqx.tree_at(lambda e: e.cost, equations, jnp.array(jnp.inf)),
-            damping=jnp.asarray(options.get("damping", _FIRST_DAMPING)),
+            damping=jnp.asarray(options.get("damping", FIRST_DAMPING)),
             raise_by=jnp.array(2.0),
             converged=jnp.array(False),
             stuck=jnp.array(False),
@@ -203,7 +203,7 @@ def solve(
     solver: BlockArrowLevenbergMarquardt | None = None,
     max_steps: int = 100,
     rtol: float = 0.0,
-    damping: float = _FIRST_DAMPING,
+    damping: float = FIRST_DAMPING,
     adjoint: optx.AbstractAdjoint | None = None,
 ) -> SolveResult:
     """Minimise a block-arrow problem from `state`; one compiled program per problem shape.
@@ -227,7 +227,7 @@ def solve_inside(
     solver: BlockArrowLevenbergMarquardt | None = None,
     max_steps: int | Int[Array, ""] = 100,
     rtol: float | Float[Array, ""] = 0.0,
-    damping: float | Float[Array, ""] = _FIRST_DAMPING,
+    damping: float | Float[Array, ""] = FIRST_DAMPING,
     adjoint: optx.AbstractAdjoint | None = None,
 ) -> SolveResult:
     """`solve` as a part of a larger jitted computation: many small problems under `lax.map`, say.
