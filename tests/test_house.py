@@ -65,6 +65,7 @@ ALLOWED: dict[str, set[str]] = {
         "jaxcal.calibration",
         "jaxcal.cameras",
         "jaxcal.estimation",
+        "jaxcal.imu",
         "jaxcal.pipeline",
         "jaxcal.recording",
         "jaxcal.results",

@@ -11,6 +11,7 @@ from jaxcal.observations import Detections, Frames, ImageSequence
 # Of each slot of time the frame nearest to this share of it is kept. An odd share, so that it hardly ever lies half
 # way between two frames, where the jitter of clocks would make simultaneous cameras keep different ones.
 _PLACE_IN_SLOT = 0.382
+_HARDLY_FASTER = 0.95
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,8 @@ class SomeImages:
 def cut_frames(frames: Frames, span_ns: tuple[int, int] | None = None, rate_hz: float | None = None) -> Frames:
     """The frames within `span_ns` (first, last; both included), and of those at most `rate_hz` a second, evenly.
 
-    Cameras whose frames are simultaneous keep simultaneous ones. Raises CalibrationError when no frame is left.
+    Cameras whose frames are simultaneous keep simultaneous ones; one that hardly takes more is left as it is. Raises
+    CalibrationError when no frame is left.
     """
     times = np.asarray(frames.timestamps_ns)
     kept = np.ones(len(times), bool) if span_ns is None else (times >= span_ns[0]) & (times <= span_ns[1])
@@ -73,6 +75,9 @@ def cut_detections(detections: Detections, span_ns: tuple[int, int] | None = Non
 
 def _thinned(times: np.ndarray, period_ns: float) -> np.ndarray:
     """Of each slot of `period_ns`, counted from time zero, the index of the frame nearest to a fixed place in it."""
+    if len(times) > 1 and np.median(np.diff(times)) > _HARDLY_FASTER * period_ns:
+        # Frames as far apart as slots are may lie on their borders, where rounding would put two into one.
+        return np.arange(len(times))
     slot = np.floor(times / period_ns)
     off = np.abs(times - (slot + _PLACE_IN_SLOT) * period_ns)
     order = np.lexsort((off, slot))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from jaxcal import CalibrationError, Detections
@@ -48,8 +48,9 @@ def test_exactly_the_frames_of_the_span_are_kept(times_ms: list[int], span: tupl
     assert [int(kept.images[k][0, 0]) for k in range(len(kept))] == wanted
 
 
-@given(st.integers(5, 60), st.integers(1, 70), st.integers(0, 10**12), st.integers(0, 2**32 - 1))
-def test_thinned_frames_are_as_many_as_asked_for(rate: int, wanted: int, start: int, seed: int) -> None:
+@given(st.integers(5, 60), st.integers(1, 70), st.integers(0, 10**12))
+@example(6, 6, 0)
+def test_thinned_frames_are_as_many_as_asked_for(rate: int, wanted: int, start: int) -> None:
     times = start + np.arange(10 * rate) * 10**9 // rate
     kept = cut_frames(frames_at(times.tolist()), rate_hz=float(wanted)).timestamps_ns
     assert abs(len(kept) - 10 * min(rate, wanted)) <= max(1, 10 * rate // 10) * (wanted > 0.5 * rate) + 1
