@@ -75,7 +75,8 @@ def _without_lens(template: CameraModel, parameters: Array, points: Array) -> tu
 
     def one(point: Array) -> tuple[Array, Array, Array]:
         pixel, pull = jax.vjp(lambda at: _pixel(template, parameters, at), point)
-        return _finite(pixel, *_pulled(pull), jnp.zeros(0))[:3]
+        (by_point,) = _pulled(pull)
+        return _finite(pixel, by_point, jnp.zeros(0))[:3]
 
     return jax.vmap(one, out_axes=-1)(points)
 
