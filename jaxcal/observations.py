@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -294,6 +294,17 @@ class Detections:
     def seen_frames(self) -> np.ndarray:
         """Indices of the frames that hold at least one corner, increasing."""
         return np.unique(self.frame)
+
+    def of_frames(self, chosen: np.ndarray) -> "Detections":
+        """The corners of some frames, `chosen` (F,) true for each; the other frames stay listed, without corners."""
+        rows = np.asarray(chosen, dtype=bool)[self.frame]
+        return replace(
+            self,
+            frame=self.frame[rows],
+            point=self.point[rows],
+            pixels=self.pixels[rows],
+            precision=None if self.precision is None else self.precision[rows],
+        )
 
     def save(self, path: str | Path) -> None:
         """Write an npz file, atomically: a reader sees the old file or the whole new one."""

@@ -278,3 +278,14 @@ def test_a_failed_save_leaves_the_old_file_alone(tmp_path: Path, monkeypatch: py
         corners(image_size=(1, 1)).save(path)
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
     assert_same(Detections.load(path), corners())
+
+
+@given(data=detections(), seed=st.integers(0, 2**31))
+def test_the_corners_of_some_frames_are_theirs_and_the_others_the_rest(data: Detections, seed: int) -> None:
+    chosen = np.random.default_rng(seed).random(len(data.timestamps_ns)) < 0.5
+    some, rest = data.of_frames(chosen), data.of_frames(~chosen)
+    assert len(some) + len(rest) == len(data)
+    assert chosen[some.frame].all()
+    assert not chosen[rest.frame].any()
+    np.testing.assert_array_equal(some.timestamps_ns, data.timestamps_ns)
+    np.testing.assert_array_equal(some.pixels, data.pixels[chosen[data.frame]])

@@ -202,15 +202,7 @@ def _imu_halves(calibration: Calibration) -> Halves:
 
 
 def _side(detections: Detections, middle_ns: int, early: bool) -> Detections:
-    rows = (detections.timestamps_ns[detections.frame] <= middle_ns) == early
-    precision = detections.precision
-    return dataclasses.replace(
-        detections,
-        frame=detections.frame[rows],
-        point=detections.point[rows],
-        pixels=detections.pixels[rows],
-        precision=None if precision is None else precision[rows],
-    )
+    return detections.of_frames((detections.timestamps_ns <= middle_ns) == early)
 
 
 def _cut(imu: ImuRecording, middle_ns: int, early: bool) -> ImuRecording:

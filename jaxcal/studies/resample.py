@@ -121,25 +121,13 @@ def with_weights(calibration: Calibration, moments: Moments, of_view: np.ndarray
     as a moment of its own (times then mean nothing but which frames go together); else once, at its own time."""
     if not repeat:
         return [
-            _only(camera.detections, (view >= 0) & (of_view[view] > 0))
+            camera.detections.of_frames((view >= 0) & (of_view[view] > 0))
             for camera, view in zip(calibration.cameras, moments.view, strict=True)
         ]
     drawn = np.repeat(np.arange(len(of_view)), of_view.astype(int))
     return [
         _drawn(camera.detections, view, drawn) for camera, view in zip(calibration.cameras, moments.view, strict=True)
     ]
-
-
-def _only(detections: Detections, frames: np.ndarray) -> Detections:
-    rows = frames[detections.frame]
-    precision = detections.precision
-    return dataclasses.replace(
-        detections,
-        frame=detections.frame[rows],
-        point=detections.point[rows],
-        pixels=detections.pixels[rows],
-        precision=None if precision is None else precision[rows],
-    )
 
 
 def _drawn(detections: Detections, view: np.ndarray, drawn: np.ndarray) -> Detections:

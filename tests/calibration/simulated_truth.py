@@ -46,10 +46,7 @@ def seen_by(rig: SimulatedRig, noise_px: float = 0.1, frames: int = FRAMES) -> l
 
 def only_frames(detections: Detections, keep: np.ndarray) -> Detections:
     """The corners of some frames (indices); the frames themselves stay listed."""
-    rows = np.isin(detections.frame, keep)
-    return dataclasses.replace(
-        detections, frame=detections.frame[rows], point=detections.point[rows], pixels=detections.pixels[rows]
-    )
+    return detections.of_frames(np.isin(np.arange(len(detections.timestamps_ns)), keep))
 
 
 def first_frames(detections: Detections, count: int) -> Detections:
