@@ -21,7 +21,7 @@ from jaxcal.calibration.robust import robust_fit
 from jaxcal.calibration.rolling import row_intervals, shutters_of
 from jaxcal.calibration.spline_setup import BinnedImu, SplineGrid
 from jaxcal.calibration.state import RigState, SharedLayout, flat_target, layout_of
-from jaxcal.calibration.target_shape import geometry_of
+from jaxcal.calibration.target_shape import TargetGeometry, geometry_of
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.estimation import LOSSES, Loss
@@ -52,6 +52,8 @@ def calibrate_camera_imu(
     names: Sequence[str] | None = None,
     intrinsics: Literal["free", "prior", "held"] = "free",
     imu_noise: Literal["at least given", "given", "estimated"] = "at least given",
+    board_warp: bool = False,
+    point_offset_sigma_m: float | None = None,
     loss: Loss = "huber",
     spline_order: int = 6,
     knot_rate_hz: float | None = None,
@@ -71,7 +73,8 @@ def calibrate_camera_imu(
     that of its first row. `cameras` an earlier calibration of the same cameras to start from. `intrinsics`: estimate
     the lenses freely, under the prior of `cameras`, or hold them. `imu_noise`: 'given' trusts the noise densities; 'at
     least given' raises them where the residuals are larger, so that sigmas stay honest; 'estimated' takes what the
-    residuals show, larger or smaller. `loss`: the robust loss under which outlying corners are found, as for
+    residuals show, larger or smaller. `board_warp`, `point_offset_sigma_m`: how the board is bent, and where its points
+    are, as for `calibrate_cameras` (offsets of all points are three unknowns each: slow). `loss`: the robust loss under which outlying corners are found, as for
     `calibrate_cameras`; they are left out of the final least squares. `spline_order` 4 to 6 and
     `knot_rate_hz`, chosen from the first IMU's own spectrum by default.
 
@@ -95,10 +98,13 @@ def calibrate_camera_imu(
     layout = layout_of(
         list(lenses),
         imus=extra_imus.places_of(imu_names),
+        warp=board_warp,
+        offsets=len(target.points) if point_offset_sigma_m is not None else 0,
         gravity_size=3 if gravity_magnitude else 2,
         rolling=shutters,
     )
-    problem = _problem(lenses, frames, target, start, binned, grid, cameras, names, intrinsics, layout, loss)
+    geometry = geometry_of(target, point_offset_sigma_m)
+    problem = _problem(lenses, frames, geometry, start, binned, grid, cameras, names, intrinsics, layout, loss)
     state = _first_state(lenses, layout, start, others, grid, first, imu_time)
 
     noise = inertial_noise.NoiseModel(binned, grid, imu_noise)
@@ -123,6 +129,8 @@ def calibrate_camera_imu(
         "rolling_shutter": shutters,
         "intrinsics": intrinsics,
         "imu_noise": imu_noise,
+        "board_warp": board_warp,
+        "point_offset_sigma_m": point_offset_sigma_m,
         "loss": loss,
         "spline_order": spline_order,
         "knot_rate_hz": 1.0 / grid.dt,
@@ -251,7 +259,7 @@ def _usable_frames(names: Sequence[str], start: _Start, grid: SplineGrid) -> lis
 def _problem(
     lenses: Sequence[CameraModel],
     frames: Sequence[CameraFrames],
-    target: Target,
+    geometry: TargetGeometry,
     start: _Start,
     binned: Sequence[BinnedImu],
     grid: SplineGrid,
@@ -271,7 +279,7 @@ def _problem(
     return RigProblem(
         templates=solving.templates_of(lenses, layout),
         corners=vision_data(layout, frames, weights=[np.ones(f.seen.shape) for f in frames], times=start.times),
-        geometry=geometry_of(target),
+        geometry=geometry,
         imu=InertialData(tuple(b.samples for b in binned), jnp.asarray(grid.start), jnp.asarray(grid.dt)),
         prior=prior,
         free_chain=jnp.ones((grid.intervals + grid.order - 1, 6 + 6 * len(binned)), dtype=bool),

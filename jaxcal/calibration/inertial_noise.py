@@ -18,6 +18,8 @@ from jaxcal.calibration.state import RigState
 _CLEARLY_CORRELATED = 0.05
 # Noise below this share of the stated one is not believed: the spline would have followed it.
 _SMALLEST_RATIO = 0.02
+# The round of `robust_fit` that takes correlations into account: the first one without robust loss.
+_CORRELATED = 3
 
 NoiseChoice = Literal["at least given", "given", "estimated"]
 
@@ -41,31 +43,47 @@ class NoiseModel:
         return [self._ratio(problem, state, i) for i in range(len(self.binned))]
 
     def _ratio(self, problem: RigProblem, state: RigState, imu: int) -> np.ndarray:
-        """Degrees of freedom of the spline accounted for.
+        """Degrees of freedom of the spline accounted for."""
+        residuals, freedom = self._stated_residuals(problem, state, imu)
+        return np.sqrt(np.mean(residuals**2, axis=0).reshape(2, 3).mean(axis=1) / freedom)
 
-        Residuals that hang together over time (a scale error, vibration, jitter of the clock) are worth fewer samples
-        than they number: their noise is raised by the root of the autocorrelation time, or they would bend the lenses.
-        """
+    def _hanging_together(self, problem: RigProblem, state: RigState, imu: int) -> np.ndarray:
+        """By how much (2,) noise is to be raised where residuals hang together over time (a scale error, vibration,
+        jitter of the clock): they are worth fewer samples than they number, or would bend the lenses."""
+        residuals, _ = self._stated_residuals(problem, state, imu)
+        times = np.array([autocorrelation_time(axis) for axis in residuals.T])
+        return np.sqrt(times.reshape(2, 3).mean(axis=1))
+
+    def _stated_residuals(self, problem: RigProblem, state: RigState, imu: int) -> tuple[np.ndarray, float]:
+        """Residuals (M, 6) in units of the stated noise, and the share of them that the spline leaves free."""
         assert problem.imu is not None
         samples = problem.imu.samples[imu]
         scale = np.asarray(self.binned[imu].samples.inverse_sigma / samples.inverse_sigma)
         residuals = (np.asarray(_whitened(problem, state, imu)) * scale)[np.asarray(samples.present) > 0]
         # The spline's freedoms are shared by all IMUs that see it.
         count = sum(len(one.index) for one in self.binned)
-        freedom = max(1.0 - (self.grid.used + self.grid.order - 1) / count, 0.1)
-        power = np.mean(residuals**2, axis=0) / freedom
-        inflated = power * np.array([autocorrelation_time(axis) for axis in residuals.T])
-        return np.sqrt(inflated.reshape(2, 3).mean(axis=1))
+        return residuals, max(1.0 - (self.grid.used + self.grid.order - 1) / count, 0.1)
 
-    def reweigh(self, problem: RigProblem, state: RigState) -> RigProblem:
+    def reweigh(self, problem: RigProblem, state: RigState, stage: int) -> RigProblem:
         """Noise as the residuals show it (never below the stated one unless that is asked for), and samples binned anew
-        where the clocks have moved."""
+        where the clocks have moved.
+
+        How long residuals hang together is seen once, in round _CORRELATED, while they have their full say: an IMU that
+        counts for little is left with the errors of the cameras' trajectory, which hang together for longer, and would
+        come to count for less and less.
+        """
         assert problem.imu is not None
         samples = list(problem.imu.samples)
-        for i, ratio in enumerate(self.ratios(problem, state)):
+        for i in range(len(samples)):
             stated = self.binned[i].at_shift(self.grid, float(state.imu_shift[i])).samples
             if self.choice == "given":
                 ratio = np.ones(2)
+            elif stage > _CORRELATED:
+                ratio = np.asarray(stated.inverse_sigma / samples[i].inverse_sigma)[[0, 3]]
+            else:
+                ratio = self._ratio(problem, state, i)
+                if stage == _CORRELATED:
+                    ratio = ratio * self._hanging_together(problem, state, i)
             ratio = np.maximum(ratio, 1.0 if self.choice == "at least given" else _SMALLEST_RATIO)
             inverse = stated.inverse_sigma / jnp.asarray(np.repeat(ratio, 3))
             samples[i] = eqx.tree_at(lambda s: s.inverse_sigma, stated, inverse)

@@ -14,6 +14,7 @@ from jaxcal.calibration.lens_basis import told_apart
 from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.redundancy import Redundancy, measure_redundancy
 from jaxcal.calibration.state import RigState
+from jaxcal.calibration.view_noise import all_alike, view_noise
 from jaxcal.errors import CalibrationError
 from jaxcal.estimation import FIRST_DAMPING, SolveResult, solve
 from jaxcal.progress import Progress
@@ -28,13 +29,14 @@ _ENOUGH_FOR_NOISE = 1e-5
 # The first step of a round that starts at the optimum of the one before is hardly damped.
 _NEXT_DAMPING = 1e-7
 
-# Adapts a problem to the residuals found so far (re-weights its IMU, say).
-Reweigh = Callable[[RigProblem, RigState], RigProblem]
+# Adapts a problem to the residuals found so far (re-weights its IMU, say) before a round.
+Reweigh = Callable[[RigProblem, RigState, int], RigProblem]
 
 
 @dataclass(frozen=True)
 class RobustFit:
-    """The optimum with what was learnt on the way: per camera errors (F, N, 2) px, inliers (F, N), corner noise px.
+    """The optimum with what was learnt on the way: per camera errors (F, N, 2) px, inliers (F, N), corner noise px (of
+    all its views together).
 
     The equations in `result` count lenses in terms of `problem.basis`.
     """
@@ -78,23 +80,25 @@ def robust_fit(
     """Solve, estimating the corner noise of each camera and leaving outliers out.
 
     Rounds: Huber's loss with `first_sigmas`; Huber's loss with the noise found (median); the same with each view
-    weighted by what it adds (`redundancy`); plain least squares on the inliers; the same with the noise of the inliers
-    (root mean square) and the inliers chosen anew. `usable[c]` (F,) are the frames that may take part;
+    weighted by what it adds (`redundancy`); plain least squares on the inliers, noisy views weighted down
+    (`view_noise`); the same with the noise of the inliers (root mean square) and the inliers chosen anew. `usable[c]` (F,) are the frames that may take part;
     `pose_parameters[c]` how many parameters of the trajectory a camera's corners pay for, for the degrees of freedom.
     """
     layout = problem.layout
     seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]
     kept, sigmas = seen, list(first_sigmas)
-    precision = [frames.precision for frames in cameras]
+    noise = all_alike([len(s) for s in seen])
+    places = np.asarray(problem.geometry.across)
     redundancy = [Redundancy(np.ones(len(s)), 1.0, 0.0) for s in seen]
     result: SolveResult | None = None
     errors: list[np.ndarray] = []
+    parameters = estimated_parameters(problem, pose_parameters)
     for stage in range(ROUNDS):
         progress("optimise", stage, ROUNDS)
         width = _HUBER_SIGMAS if stage < 3 else np.inf
-        problem = _with_weights(problem, cameras, kept, sigmas, redundancy, width)
+        problem = _with_weights(problem, cameras, kept, sigmas, redundancy, noise, width)
         if reweigh is not None and result is not None:
-            problem = reweigh(problem, state)
+            problem = reweigh(problem, state, stage)
         if result is not None:
             basis = told_apart(problem.basis, result.equations, np.asarray(problem.free), layout)
             problem = eqx.tree_at(lambda p: p.basis, problem, basis, is_leaf=lambda leaf: leaf is None)
@@ -109,7 +113,10 @@ def robust_fit(
         state = result.state
         errors = split_groups(layout, cameras, [np.asarray(e) for e in corner_errors(problem, state)])
         # In units of an ordinary corner: what a detector knows to be vague may err more.
-        scaled = [e * p[..., None] for e, p in zip(errors, precision, strict=True)]
+        scaled = [
+            e * frames.precision[..., None] / n[:, None, None]
+            for e, frames, n in zip(errors, cameras, noise, strict=True)
+        ]
         if not np.isfinite(float(result.equations.cost)):
             raise CalibrationError(
                 "the optimisation diverged: the residuals are not finite. Check for frames with a wrong board, and "
@@ -121,8 +128,10 @@ def robust_fit(
             redundancy = [measure_redundancy(*parts) for parts in zip(cameras, scaled, seen, sigmas, strict=True)]
         if stage == 2:
             kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(scaled, seen, sigmas, strict=True)]
+            noise = [view_noise(e, k, places) for e, k in zip(scaled, kept, strict=True)]
+            scaled = [e / n[:, None, None] for e, n in zip(scaled, noise, strict=True)]
+            sigmas = [outliers.robust_sigma(e, k) for e, k in zip(scaled, kept, strict=True)]
         if stage >= 3:
-            parameters = estimated_parameters(problem, pose_parameters)
             sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(scaled, kept, parameters, strict=True)]
         if stage == 3:
             # Good corners that outliers in the same view had pulled away are taken back.
@@ -136,6 +145,8 @@ def robust_fit(
         )
     progress("optimise", ROUNDS, ROUNDS)
     assert result is not None
+    usual = [e * frames.precision[..., None] for e, frames in zip(errors, cameras, strict=True)]
+    sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(usual, kept, parameters, strict=True)]
     return RobustFit(problem, result, errors, kept, sigmas, redundancy)
 
 
@@ -156,11 +167,12 @@ def _with_weights(
     kept: Sequence[np.ndarray],
     sigmas: Sequence[float],
     redundancy: Sequence[Redundancy],
+    noise: Sequence[np.ndarray],
     loss_width: float,
 ) -> RigProblem:
     weights = [
-        k * r.weights[:, None] * (frames.precision / sigma) ** 2
-        for k, sigma, r, frames in zip(kept, sigmas, redundancy, cameras, strict=True)
+        k * (r.weights / n**2)[:, None] * (frames.precision / sigma) ** 2
+        for k, sigma, r, n, frames in zip(kept, sigmas, redundancy, noise, cameras, strict=True)
     ]
     return eqx.tree_at(
         lambda p: [*[data.weight for data in p.corners], p.loss_width],

@@ -108,7 +108,7 @@ def camera_problem(
     problem = RigProblem(
         templates=templates_of(models, layout),
         corners=vision_data(layout, cameras, weights=weights, views=views),
-        geometry=geometry_of(target) if offset_sigma_m is None else geometry_of(target, offset_sigma_m),
+        geometry=geometry_of(target, offset_sigma_m),
         imu=None,
         prior=lens_prior(models, layout, cameras),
         free_chain=jnp.asarray(free_chain),

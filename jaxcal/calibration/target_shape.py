@@ -21,7 +21,11 @@ class TargetGeometry(eqx.Module):
     offset_sigma: Float[Array, ""]
 
 
-def geometry_of(target: Target, offset_sigma_m: float = 1e-3) -> TargetGeometry:
+# How far a point may plausibly be from its place, where nobody said (m).
+_OFFSET_SIGMA_M = 1e-3
+
+
+def geometry_of(target: Target, offset_sigma_m: float | None = None) -> TargetGeometry:
     """The stated geometry of a target."""
     board = np.asarray(target.board_of_point)
     across = np.zeros((len(board), 2))
@@ -33,7 +37,7 @@ def geometry_of(target: Target, offset_sigma_m: float = 1e-3) -> TargetGeometry:
         points=jnp.asarray(target.points),
         board=jnp.asarray(board),
         across=jnp.asarray(across),
-        offset_sigma=jnp.asarray(float(offset_sigma_m)),
+        offset_sigma=jnp.asarray(_OFFSET_SIGMA_M if offset_sigma_m is None else float(offset_sigma_m)),
     )
 
 

@@ -89,7 +89,7 @@ def continuous_problem(
     problem = RigProblem(
         templates=solving.templates_of(lenses, layout),
         corners=vision_data(layout, cameras, weights=[np.ones(f.seen.shape) for f in cameras], times=times),
-        geometry=geometry_of(target) if offset_sigma_m is None else geometry_of(target, offset_sigma_m),
+        geometry=geometry_of(target, offset_sigma_m),
         imu=_motion_prior(grid),
         prior=solving.lens_prior(lenses, layout, cameras),
         free_chain=jnp.ones((knots, 6), dtype=bool),
