@@ -74,9 +74,9 @@ def calibrate_camera_imu(
     the lenses freely, under the prior of `cameras`, or hold them. `imu_noise`: 'given' trusts the noise densities; 'at
     least given' raises them where the residuals are larger, so that sigmas stay honest; 'estimated' takes what the
     residuals show, larger or smaller. `board_warp`, `point_offset_sigma_m`: how the board is bent, and where its points
-    are, as for `calibrate_cameras` (offsets of all points are three unknowns each: slow). `loss`: the robust loss under which outlying corners are found, as for
-    `calibrate_cameras`; they are left out of the final least squares. `spline_order` 4 to 6 and
-    `knot_rate_hz`, chosen from the first IMU's own spectrum by default.
+    are, as for `calibrate_cameras` (offsets of all points are three unknowns each: slow). `loss`: the robust loss under
+    which outlying corners are found, as for `calibrate_cameras`; they are left out of the final least squares.
+    `spline_order` 4 to 6 and `knot_rate_hz`, chosen from the first IMU's own spectrum by default.
 
     Raises CalibrationError when frames and IMU do not overlap or do not move together, and as `calibrate_cameras`.
     """

@@ -16,7 +16,9 @@ from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.redundancy import measure_redundancy
 from jaxcal.calibration.robust import corner_errors
 from jaxcal.calibration.state import RigState, SharedLayout, layout_of
+from jaxcal.calibration.target_shape import geometry_of
 from jaxcal.calibration.validation import known_graph, known_target
+from jaxcal.calibration.view_noise import weigh_views
 from jaxcal.calibration.views import associate
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
@@ -29,9 +31,9 @@ class KnownProblem:
     """Plain least squares over the corners that a calibration kept, from its solution.
 
     `views[c]` (F,) is the view of each frame of camera c, `times_s` (V,) their times since the first; `kept[c]` (F, N)
-    marks the corners that take part, with `weights[c]` (F, N), px^-2. `inflation` is what the covariance of these
-    weights is too small by (`redundancy`). `tied`: the cameras' poses among each other are estimated, from views that
-    they share; else each frame is a view of its own and those poses are held.
+    marks the corners that take part, with `weights[c]` (F, N), px^-2, and `noise_px[c]` (F, N) of a coordinate.
+    `inflation` is what the covariance of these weights is too small by (`redundancy`). `tied`: the cameras' poses among
+    each other are estimated, from views that they share; else each frame is a view of its own and those poses are held.
     """
 
     calibration: Calibration
@@ -40,6 +42,7 @@ class KnownProblem:
     times_s: np.ndarray
     kept: list[np.ndarray]
     weights: list[np.ndarray]
+    noise_px: list[np.ndarray]
     inflation: float
     tied: bool
     problem: RigProblem
@@ -132,7 +135,7 @@ def known_problem(
         warp=warp,
         offsets=len(target.points) if shape is not None and shape.offsets_m is not None else 0,
     )
-    weights, inflation = _weights(calibration, cameras, kept)
+    weights, noises, inflation = _weights(calibration, cameras, kept)
     graph = known_graph(calibration)
     problem, state = solving.camera_problem(
         lenses,
@@ -154,7 +157,7 @@ def known_problem(
             free[layout.pose(c)] = False
         problem = eqx.tree_at(lambda p: p.free, problem, jnp.asarray(free))
     since = (times - times.min()) * 1e-9
-    return KnownProblem(calibration, cameras, views, since, kept, weights, inflation, tied, problem, state)
+    return KnownProblem(calibration, cameras, views, since, kept, weights, noises, inflation, tied, problem, state)
 
 
 def _dense(frames: CameraFrames, per_corner: np.ndarray) -> np.ndarray:
@@ -182,18 +185,25 @@ def _views(
 
 def _weights(
     calibration: Calibration, cameras: Sequence[CameraFrames], kept: Sequence[np.ndarray]
-) -> tuple[list[np.ndarray], float]:
-    """1 / sigma^2 (F, N) of every corner kept, with views that repeat each other counting less, as there."""
-    weights, inflations = [], []
+) -> tuple[list[np.ndarray], list[np.ndarray], float]:
+    """1 / sigma^2 (F, N) of every corner kept, with views that repeat each other counting less, as there; the noise
+    (F, N) of every corner, px; and by how much covariances are too small."""
+    weights, noises, inflations = [], [], []
+    places = np.asarray(geometry_of(calibration.target).across)
     for camera, frames, own in zip(calibration.cameras, cameras, kept, strict=True):
-        errors = np.zeros((*own.shape, 2))
-        whole = np.zeros((len(camera.detections.timestamps_ns), *errors.shape[1:]))
+        whole = np.zeros((len(camera.detections.timestamps_ns), *own.shape[1:], 2))
         whole[camera.detections.frame, camera.detections.point] = np.nan_to_num(camera.residuals_px)
-        errors = whole[frames.frames]
-        found = measure_redundancy(frames, errors * frames.precision[..., None], own, camera.corner_sigma_px)
-        weights.append(own * found.weights[:, None] * (frames.precision / camera.corner_sigma_px) ** 2)
+        errors = whole[frames.frames] * frames.precision[..., None]
+        found = measure_redundancy(frames, errors, own, camera.corner_sigma_px)
+        found, noise = weigh_views(frames, errors, own, places, found)
+        of_view = noise[:, None]
+        # The sigma that the result states is that of all views together.
+        power = np.sum(errors[own] ** 2), np.sum((errors / of_view[..., None])[own] ** 2)
+        usual = camera.corner_sigma_px * (np.sqrt(power[1] / power[0]) if power[0] > 0 else 1.0)
+        noises.append(usual * of_view / frames.precision)
+        weights.append(own * found.weights[:, None] / noises[-1] ** 2)
         inflations.append(found.inflation)
-    return weights, max(inflations)
+    return weights, noises, max(inflations)
 
 
 def _rig_poses(

@@ -67,9 +67,25 @@ def measure_redundancy(frames: CameraFrames, errors: np.ndarray, usable: np.ndar
     correlation = _correlation_of_look_alikes(features, errors, usable)
     if correlation < _NEGLIGIBLE:
         return even
-    weights = 1.0 / _stands_for(features)
+    weights, inflation = _shared_out(features, np.ones(count))
+    return Redundancy(weights, inflation, correlation)
+
+
+def spread_over_look_alikes(frames: CameraFrames, redundancy: Redundancy, noise: np.ndarray) -> Redundancy:
+    """The same with noisy views (`noise` (F,), relative) counting less than those that look like them, but look-alikes
+    together as much as before."""
+    if redundancy.correlation < _NEGLIGIBLE:
+        return redundancy
+    weights, inflation = _shared_out(view_features(frames), 1.0 / noise**2)
+    return Redundancy(weights, inflation, redundancy.correlation)
+
+
+def _shared_out(features: np.ndarray, worth: np.ndarray) -> tuple[np.ndarray, float]:
+    """Weights (F,) that share out the worth of views among those that look alike, about 1 for views that stand for
+    themselves; and how much too small a covariance from them is."""
+    weights = worth / _stands_for(features, worth)
     full = float(np.quantile(weights, _FULL_WEIGHT_QUANTILE))
-    return Redundancy(np.minimum(weights / full, _LARGEST_WEIGHT), 1.0 / full, correlation)
+    return np.minimum(weights / full, _LARGEST_WEIGHT), 1.0 / full
 
 
 def _correlation_of_look_alikes(features: np.ndarray, errors: np.ndarray, usable: np.ndarray) -> float:
@@ -89,13 +105,13 @@ def _correlation_of_look_alikes(features: np.ndarray, errors: np.ndarray, usable
     return product / power if len(pairs) >= 10 and power > 0 else 0.0
 
 
-def _stands_for(features: np.ndarray) -> np.ndarray:
-    """How many views each one stands for, itself included (F,): look-alikes count by how alike they are."""
+def _stands_for(features: np.ndarray, worth: np.ndarray) -> np.ndarray:
+    """The worth (F,) of each view and of its look-alikes together: these count by how alike they are."""
     step = max(1, len(features) // _MOST_VIEWS)
     others = features[::step]
     total = np.empty(len(features))
     for start in range(0, len(features), 500):
         rows = features[start : start + 500]
         distance = np.linalg.norm(rows[:, None] - others[None], axis=-1)
-        total[start : start + 500] = np.maximum(1.0 - distance / _ALIKE, 0.0).sum(axis=1) * step
-    return np.maximum(total, 1.0)
+        total[start : start + 500] = (np.maximum(1.0 - distance / _ALIKE, 0.0) @ worth[::step]) * step
+    return np.maximum(total, worth)

@@ -14,7 +14,7 @@ from jaxcal.calibration.lens_basis import told_apart
 from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.redundancy import Redundancy, measure_redundancy
 from jaxcal.calibration.state import RigState
-from jaxcal.calibration.view_noise import all_alike, view_noise
+from jaxcal.calibration.view_noise import all_alike, weigh_views
 from jaxcal.errors import CalibrationError
 from jaxcal.estimation import FIRST_DAMPING, SolveResult, solve
 from jaxcal.progress import Progress
@@ -81,8 +81,9 @@ def robust_fit(
 
     Rounds: Huber's loss with `first_sigmas`; Huber's loss with the noise found (median); the same with each view
     weighted by what it adds (`redundancy`); plain least squares on the inliers, noisy views weighted down
-    (`view_noise`); the same with the noise of the inliers (root mean square) and the inliers chosen anew. `usable[c]` (F,) are the frames that may take part;
-    `pose_parameters[c]` how many parameters of the trajectory a camera's corners pay for, for the degrees of freedom.
+    (`view_noise`); the same with the noise of the inliers (root mean square) and the inliers chosen anew. `usable[c]`
+    (F,) are the frames that may take part; `pose_parameters[c]` how many parameters of the trajectory a camera's
+    corners pay for, for the degrees of freedom.
     """
     layout = problem.layout
     seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]
@@ -128,7 +129,8 @@ def robust_fit(
             redundancy = [measure_redundancy(*parts) for parts in zip(cameras, scaled, seen, sigmas, strict=True)]
         if stage == 2:
             kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(scaled, seen, sigmas, strict=True)]
-            noise = [view_noise(e, k, places) for e, k in zip(scaled, kept, strict=True)]
+            weighed = [weigh_views(*p, places, r) for *p, r in zip(cameras, scaled, kept, redundancy, strict=True)]
+            redundancy, noise = [w for w, _ in weighed], [n for _, n in weighed]
             scaled = [e / n[:, None, None] for e, n in zip(scaled, noise, strict=True)]
             sigmas = [outliers.robust_sigma(e, k) for e, k in zip(scaled, kept, strict=True)]
         if stage >= 3:

@@ -2,27 +2,75 @@
 
 A view's noise is what is left of its residuals when a smooth displacement over the board is taken out, since that is
 the model's error (a lean lens, a bent board, a wrong pose) and no noise: the views at the image's rim, where models
-err most, must not count less for it.
+err most, must not count less for it. Where the lens is too lean for the corners, least squares with these weights
+would choose the image's middle over its rim, since a camera that turns fast has noisy views at the rim; noisy views
+then count less than views that look like them, but no place in the image counts less than another.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from jaxcal.calibration.assemble import CameraFrames
+from jaxcal.calibration.redundancy import Redundancy, spread_over_look_alikes
+
 # Smooth displacements: polynomials of this many terms (second degree) in the places on the board, for u and for v.
 _TERMS = 6
 # Views whose noise differs by less than this (standard deviation of the logarithm of the variance) are all alike.
 _ALIKE = 0.15
 _LARGEST_RATIO = 4.0
+# A lens is too lean when more than this share of the squared residuals goes by the place in the image.
+_LEAN = 0.05
+_CELLS = 12  # of the image's longer side
+_FEWEST_IN_CELL = 30
+
+
+def weigh_views(
+    frames: CameraFrames, errors: np.ndarray, kept: np.ndarray, places: np.ndarray, redundancy: Redundancy
+) -> tuple[Redundancy, np.ndarray]:
+    """What the views of a camera are worth with their noise in view: weights, and the noise (F,) of each beside them.
+
+    `errors` (F, N, 2) of the corners in units of what the detector claims, `kept` (F, N) the inliers, `places` (N, 2)
+    of the points on the board.
+    """
+    noise = view_noise(errors, kept, places)
+    if share_of_place(frames, errors, kept) < _LEAN:
+        return redundancy, noise
+    return spread_over_look_alikes(frames, redundancy, noise), np.ones(len(noise))
+
+
+def share_of_place(frames: CameraFrames, errors: np.ndarray, kept: np.ndarray) -> float:
+    """The share of squared residuals (F, N, 2) that the place in the image explains, beyond chance: what is left of a
+    lens that its model cannot say. What goes by the point of the board (a detector's bias) is taken out first."""
+    if not kept.any():
+        return 0.0
+    point = np.broadcast_to(np.arange(kept.shape[1]), kept.shape)[kept]
+    left = errors[kept] - _means(errors[kept], point)
+    cell = (frames.pixels[kept] * (_CELLS / max(frames.detections.image_size))).astype(int).clip(0, _CELLS)
+    cell = cell[:, 1] * (_CELLS + 1) + cell[:, 0]
+    counts = np.bincount(cell)
+    full = counts[cell] >= _FEWEST_IN_CELL
+    left, cell = left[full], cell[full]
+    total = float(np.sum(left**2))
+    if total <= 0 or len(cell) < 2:
+        return 0.0
+    explained = float(np.sum(_means(left, cell) ** 2)) / total
+    by_chance = len(np.unique(cell)) / len(cell)
+    return (explained - by_chance) / (1.0 - by_chance)
+
+
+def _means(values: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Mean (M, 2) over the group of each of the values (M, 2)."""
+    count = np.maximum(np.bincount(group), 1)
+    return np.stack([(np.bincount(group, values[:, k]) / count)[group] for k in (0, 1)], axis=1)
 
 
 def view_noise(errors: np.ndarray, kept: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Noise (F,) of the views of one camera, relative to the usual one's.
+    """Noise (F,) of the views of one camera, relative to the usual one's. Arguments as for `weigh_views`.
 
-    `errors` (F, N, 2) of the corners in units of what the detector claims, `kept` (F, N) the inliers, `places` (N, 2)
-    of the points on the board. Empirical Bayes: the logarithms of the variances scatter because few residuals tell
-    each, by 2 / freedom, and because views differ, by the rest; each is drawn to their mean by the share of the
-    former (Efron and Morris 1975, eq. 1.5, on log variances). Views that are alike all get exactly one.
+    Empirical Bayes: the logarithms of the variances scatter because few residuals tell each, by 2 / freedom, and
+    because views differ, by the rest; each is drawn to their mean by the share of the former (in the manner of Efron
+    and Morris 1975, eq. 1.5, on log variances). Views that are alike all get exactly one.
     """
     count = len(errors)
     freedom = 2.0 * (kept.sum(axis=1) - _TERMS)

@@ -207,6 +207,11 @@ def _find(path: Path) -> Path:
 
 
 def _read_arrays(file: Path) -> dict[str, np.ndarray]:
+    if file.suffix.lower() in (".yaml", ".yml", ".json", ".txt"):
+        raise CalibrationError(
+            f"{file}: expected the folder that `calibration.save` wrote, or its calibration.npz. Files of other "
+            "tools are read by `jaxcal.results.interchange.read_calibration` (without their uncertainty)."
+        )
     try:
         # Opened here, because numpy leaves a file open that turns out to be damaged.
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:

@@ -54,11 +54,7 @@ def batch_of(calibration: Calibration) -> Batch:
     corner (F, N), px. Raises CalibrationError as `known_problem` does."""
     known = known_problem(calibration)
     fitted = [frames.pixels + error for frames, error in zip(known.cameras, known.errors(known.state), strict=True)]
-    noise = [
-        camera.corner_sigma_px / frames.precision
-        for camera, frames in zip(calibration.cameras, known.cameras, strict=True)
-    ]
-    return Batch(known, fitted, noise)
+    return Batch(known, fitted, known.noise_px)
 
 
 def run_batch(batch: Batch, pixels: list[list[np.ndarray]] | None, of_view: np.ndarray) -> ManyFits:
