@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from jaxcal.calibration import calibrate_camera_imu, calibrate_cameras
+from jaxcal.calibration import calibrate_camera_imu, calibrate_cameras, cross_validate
 from jaxcal.cameras import camera_model
 from jaxcal.detection import detect
 from jaxcal.event_frames import frames_key, write_event_frames
@@ -19,7 +19,7 @@ from jaxcal.recording import EventFile, Rig, RigCamera, load_frames, load_rig
 from jaxcal.recording.cut import cut_detections, cut_frames
 from jaxcal.recording.windows import WindowPlan
 from jaxcal.recording.yaml_files import located
-from jaxcal.results import Calibration
+from jaxcal.results import Calibration, save_cross_validation
 from jaxcal.results.report import write_report
 
 
@@ -31,7 +31,8 @@ class PipelineSettings:
     folder for reconstructed frames and detections; None: `.jaxcal` beside rig.yaml, or in the output folder where
     that cannot be written. `camera_imu`, `cameras`: arguments of `calibrate_camera_imu` and `calibrate_cameras`, which
     go before what rig.yaml says below `calibration`. `reconstructor`: options of `reconstruction.Reconstructor`, which
-    go before those below `reconstruction`. `report`: write report.html.
+    go before those below `reconstruction`. `report`: write report.html. `cross_validate`: cross-validate the result,
+    too, and show that in the report (takes about as long again).
     """
 
     window_ms: float = 33.0
@@ -40,6 +41,7 @@ class PipelineSettings:
     cameras: Mapping[str, Any] = field(default_factory=dict)
     reconstructor: Mapping[str, Any] = field(default_factory=dict)
     report: bool = True
+    cross_validate: bool = False
 
 
 def run_pipeline(
@@ -57,8 +59,8 @@ def run_pipeline(
     `results.txt` and `report.html`. Frames and detections are cached (see `PipelineSettings.cache`): what is there
     for the same files and settings is not made again. `workers` processes detect corners (None: one per core).
 
-    Raises CalibrationError when the rig or its files have a mistake, no corners are found, or the views do not
-    determine the calibration.
+    Raises CalibrationError when the rig or its files have a mistake, no corners are found, the views do not determine
+    the calibration, or (the result is saved by then) there are too few of them for the cross-validation asked for.
     """
     settings = settings or PipelineSettings()
     rig = rig if isinstance(rig, Rig) else load_rig(rig)
@@ -72,8 +74,11 @@ def run_pipeline(
     detections, images = detect_rig(rig, cache, settings=settings, workers=workers, progress=progress)
     calibration = _calibrated(rig, detections, imus, options, progress)
     calibration.save(output)
+    found = cross_validate(calibration, progress=progress) if settings.cross_validate else None
+    if found is not None:
+        save_cross_validation(found, output)
     if settings.report:
-        write_report(calibration, output / "report.html", images=images, progress=progress)
+        write_report(calibration, output / "report.html", images=images, progress=progress, cross_validation=found)
     return calibration
 
 

@@ -73,6 +73,8 @@ ALLOWED: dict[str, set[str]] = {
         "jaxcal.targets",
     }
     | OBSERVATIONS,
+    # Sphinx's configuration, beside the pages.
+    "jaxcal.docs": set(),
     # The command may use every room.
     "jaxcal.cli": {"jaxcal", "reconstruction"},
     "reconstruction": OBSERVATIONS,

@@ -21,6 +21,9 @@ from jaxcal.cli.outcome import EXIT_CODES
 @click.option("--window-ms", type=float, help="Length of an event window, where RIG.yaml does not say (33).")
 @click.option("--workers", type=int, help="Processes for detection (one per core).")
 @click.option("--report/--no-report", default=True, help="Write report.html, too (some seconds).  [default: report]")
+@click.option(
+    "--cross-validate", is_flag=True, help="Cross-validate the result, too, for the report; see that command."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 @click.pass_context
 def calibrate(
@@ -30,6 +33,7 @@ def calibrate(
     window_ms: float | None,
     workers: int | None,
     report: bool,
+    cross_validate: bool,
     as_json: bool,
 ) -> None:
     """Calibrate the cameras, event cameras and IMUs that a rig.yaml names, jointly.
@@ -74,11 +78,14 @@ def calibrate(
     from jaxcal.cli.outcome import show_calibration
     from jaxcal.cli.progress_bars import ProgressBars
     from jaxcal.pipeline import PipelineSettings, run_pipeline
+    from jaxcal.results import load_cross_validation
 
-    settings = PipelineSettings(report=report)
+    settings = PipelineSettings(report=report, cross_validate=cross_validate)
     if window_ms is not None:
         settings = replace(settings, window_ms=window_ms)
     with ProgressBars() as bars:
         calibration = run_pipeline(rig, output, settings=settings, workers=workers, progress=bars)
     truth = rig.parent / "ground_truth.yaml"
-    ctx.exit(show_calibration(calibration, output, as_json=as_json, ground_truth=truth))
+    found = load_cross_validation(output) if cross_validate else None
+    status = show_calibration(calibration, output, as_json=as_json, ground_truth=truth, cross_validation=found)
+    ctx.exit(status)

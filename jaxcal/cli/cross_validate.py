@@ -24,17 +24,20 @@ def cross_validate(result: Path, no_imu: bool, as_json: bool, plot: Path | None)
     Cameras are calibrated from halves of the views (in turns, in time, near and far), and what the halves say of the
     image is compared with what the noise of the corners explains. Then each likely cause is tested on the residuals,
     and tried on views held back: a lens model too lean, a bent or misprinted board, a rolling shutter taken for global,
-    a lens or a camera's place that changed on the way. The exit status is 3 when there is more than noise.
+    a lens or a camera's place that changed on the way. The outcome is kept beside RESULT, and `jaxcal report RESULT`
+    shows it with its map. The exit status is 3 when there is more than noise.
     """
     from jaxcal.calibration import cross_validate as validate
     from jaxcal.cli.progress_bars import ProgressBars
     from jaxcal.errors import CalibrationError
-    from jaxcal.results import load_calibration
+    from jaxcal.results import load_calibration, save_cross_validation
 
     if plot is not None and plot.suffix not in (".png", ".svg", ".pdf"):
         raise CalibrationError(f"{plot}: pictures end in .png, .svg or .pdf. Name it so.")
     with ProgressBars() as bars:
         found = validate(load_calibration(result), imu_halves=not no_imu, progress=bars)
+    folder = result if result.is_dir() else result.parent
+    kept = save_cross_validation(found, folder)
     if plot is not None:
         from jaxcal.results.compare_figure import write_comparison_figure
 
@@ -43,5 +46,7 @@ def cross_validate(result: Path, no_imu: bool, as_json: bool, plot: Path | None)
     click.echo(json.dumps(found.to_json(), indent=2) if as_json else found.text().rstrip("\n"))
     if plot is not None and not as_json:
         click.echo(f"{plot}: written")
+    if not as_json:
+        click.echo(f"{kept}: written; `jaxcal report {result}` shows it")
     if found.flagged:
         raise SystemExit(NOT_GOOD)

@@ -10,7 +10,7 @@ import click
 if TYPE_CHECKING:
     import numpy as np
 
-    from jaxcal.results import Calibration, Verdict
+    from jaxcal.results import Calibration, CrossValidation, Verdict
 
 # Exit codes of all commands; click itself ends in 2 when a command is used wrongly.
 FINE, IMPOSSIBLE, MISUSED, NOT_GOOD = 0, 1, 2, 3
@@ -28,11 +28,12 @@ def show_calibration(
     as_json: bool = False,
     files: dict[str, Path] | None = None,
     ground_truth: Path | None = None,
+    cross_validation: "CrossValidation | None" = None,
 ) -> int:
     """Print a calibration that was written to `output`; gives the exit code.
 
-    First the parameters, or their comparison with `ground_truth` where that file exists; then warnings, the verdict in
-    words, and where the files are: report.html, and `files` by what they are.
+    First the parameters, or their comparison with `ground_truth` where that file exists; then warnings, what a
+    `cross_validation` found, the verdict in words, and where the files are: report.html, and `files` by what they are.
     """
     from jaxcal.results import judge, results_text
 
@@ -40,7 +41,10 @@ def show_calibration(
     listed = {"report": output / "report.html", "all results": output, **(files or {})}
     listed = {what: path.resolve() for what, path in listed.items() if path.exists()}
     if as_json:
-        click.echo(json.dumps(calibration_json(calibration, verdict, listed), indent=2))
+        told = calibration_json(calibration, verdict, listed)
+        if cross_validation is not None:
+            told["cross_validation"] = plain(cross_validation.to_json())
+        click.echo(json.dumps(told, indent=2))
         return exit_code(verdict)
     if ground_truth is not None and ground_truth.exists():
         from jaxcal.results.ground_truth import compare_with_ground_truth, comparison_table
@@ -53,6 +57,8 @@ def show_calibration(
         click.echo(results_text(calibration))
     for warning in calibration.warnings:
         click.echo(f"warning: {warning}")
+    if cross_validation is not None:
+        click.echo(f"cross-validation: {cross_validation.headline}")
     click.echo(f"verdict: {verdict.headline}")
     for what, path in listed.items():
         click.echo(f"{what}: {path}")

@@ -23,12 +23,12 @@ def report(result: Path, sources: tuple[str, ...], out: Path | None) -> None:
     jaxcal report result/ --images cam0=left/ --images cam1=right/ --out for_the_lab.html
 
     RESULT is a folder of jaxcal's, or its calibration.npz. A calibration does not hold pictures: without --images the
-    page shows none.
+    page shows none. What `jaxcal cross-validate RESULT` found is shown, too.
     """
     from jaxcal.cli.progress_bars import ProgressBars
     from jaxcal.errors import CalibrationError
     from jaxcal.recording import load_frames
-    from jaxcal.results import judge, load_calibration, write_report
+    from jaxcal.results import judge, load_calibration, load_cross_validation, write_report
 
     calibration = load_calibration(result)
     names = [camera.name for camera in calibration.cameras]
@@ -40,8 +40,9 @@ def report(result: Path, sources: tuple[str, ...], out: Path | None) -> None:
         if name not in names:
             raise CalibrationError(f"--images {source}: there is no camera '{name}'; {result} has {', '.join(names)}.")
         images[name] = load_frames(folder)
-    path = out or (result if result.is_dir() else result.parent) / "report.html"
+    folder = result if result.is_dir() else result.parent
+    path = out or folder / "report.html"
     with ProgressBars() as bars:
-        write_report(calibration, path, images=images, progress=bars)
+        write_report(calibration, path, images=images, progress=bars, cross_validation=load_cross_validation(folder))
     click.echo(judge(calibration).headline)
     click.echo(f"report: {path.resolve()}")

@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration, TargetShape
 from jaxcal.results.compare import compare
+from jaxcal.results.cross_validation import CrossValidation
+from jaxcal.results.cross_validation_files import load_cross_validation, save_cross_validation
 from jaxcal.results.difference import RigDifference
 from jaxcal.results.files import load_calibration, save_calibration
 from jaxcal.results.interchange import CalibratedRig, read_calibration, rig_of, write_calibration
@@ -21,6 +23,7 @@ __all__ = [
     "Calibration",
     "CamchainCamera",
     "CameraCalibration",
+    "CrossValidation",
     "ImuCalibration",
     "ProjectionUncertainty",
     "ResidualStatistics",
@@ -31,12 +34,14 @@ __all__ = [
     "judge",
     "load_calibration",
     "load_camchain",
+    "load_cross_validation",
     "projection_uncertainty",
     "read_calibration",
     "residual_statistics",
     "results_text",
     "rig_of",
     "save_calibration",
+    "save_cross_validation",
     "write_calibration",
     "write_report",
 ]

@@ -14,7 +14,9 @@ from jaxcal.observations import Frames
 from jaxcal.progress import Progress, no_progress
 from jaxcal.results.advice import advice
 from jaxcal.results.calibration import Calibration
+from jaxcal.results.cross_validation import CrossValidation
 from jaxcal.results.report.camera_figures import camera_pictures
+from jaxcal.results.report.cross_validation_section import cross_validation_section
 from jaxcal.results.report.drawing import ACCENT, Picture, label, nothing_to_show, panel, to_svg
 from jaxcal.results.report.frames import FramePicture, frame_pictures
 from jaxcal.results.report.imu_figures import imu_pictures
@@ -30,11 +32,13 @@ def write_report(
     path: str | Path,
     images: Mapping[str, Frames] | None = None,
     progress: Progress = no_progress,
+    cross_validation: CrossValidation | None = None,
 ) -> None:
     """Write the report of a calibration to `path`, atomically, as a single HTML file without external references.
 
     `images` are the frames in which the corners of a camera were found, by camera name; cameras without them are
-    reported without pictures of their detections. Raises CalibrationError when an image has not its camera's size.
+    reported without pictures of their detections. A `cross_validation` of this calibration gets a section of its own.
+    Raises CalibrationError when an image has not its camera's size.
     """
     stage = "report"
     total = len(calibration.cameras) + 1
@@ -53,7 +57,8 @@ def write_report(
             }
         )
         progress(stage, index + 1, total)
-    page = _template().render(**_content(calibration), cameras=cameras)
+    cross = None if cross_validation is None else cross_validation_section(cross_validation)
+    page = _template().render(**_content(calibration), cameras=cameras, cross=cross)
     write_text(Path(path), page)
     progress(stage, total, total)
 

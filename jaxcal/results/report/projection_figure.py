@@ -23,7 +23,7 @@ def projection_picture(calibration: Calibration, camera: CameraCalibration, pref
         corners = camera.detections.pixels[camera.used]
         faint = float(np.clip(4000.0 / max(len(corners), 1), 0.04, 0.4))
         axes.plot(*corners.T, ".", markersize=1.2, color=POINT, alpha=faint, rasterized=True)
-        levels = _levels(found.sigma_px)
+        levels = contour_levels(found.sigma_px)
         if len(levels):
             lines = axes.contour(
                 x, y, np.ma.masked_invalid(found.sigma_px), levels=levels, colors=[ACCENT], linewidths=1.2
@@ -43,8 +43,8 @@ def projection_picture(calibration: Calibration, camera: CameraCalibration, pref
     )
 
 
-def _levels(sigma: np.ndarray) -> np.ndarray:
-    """Contour levels between the smallest and the largest sigma (px)."""
+def contour_levels(sigma: np.ndarray) -> np.ndarray:
+    """Contour levels between the smallest and the largest value (px)."""
     finite = sigma[np.isfinite(sigma)]
     if not len(finite):
         return finite
