@@ -19,6 +19,12 @@ from jaxcal.calibration.initial_poses import rotations
 _FIRST_DAMPING = 1e-3
 _FREE_DAMPING = 1e-9
 _LARGEST_DAMPING = 1e10
+# Poses by themselves: settled when the cost falls by less than this share, or after some failures on end (the damping's
+# factor doubles with each); compared with a rival after some steps, and given up where they are far above it.
+_POSE_RTOL = 1e-7
+_FAILED = 10.0
+_FAIR_STEPS = 3
+_HOPELESS = 9.0
 # Keeps what no corner determines from making a matrix singular.
 _ROUNDING = 1e-13
 
@@ -104,31 +110,44 @@ def squared_errors(lens: Lens, fit: Fit, views: Views, far: float) -> np.ndarray
     return np.where(seen.valid & np.isfinite(squared), np.minimum(squared, far**2), far**2)
 
 
-def fit_poses(lens: Lens, start: Fit, views: Views, *, steps: int, width: float, cap: float) -> tuple[Fit, np.ndarray]:
+def fit_poses(
+    lens: Lens,
+    start: Fit,
+    views: Views,
+    *,
+    steps: int,
+    width: float,
+    cap: float,
+    beat: np.ndarray | None = None,
+) -> tuple[Fit, np.ndarray]:
     """Optimise every pose by itself with the lens as it is; the fit and the cost of each view (B, F).
 
-    `width` of Huber's loss and `cap` on an error, px.
+    `width` of Huber's loss and `cap` on an error, px. `beat` (B, F): poses that are still far above this cost after
+    some steps are given up. Views that have settled take no part in further steps.
     """
-    parameters, rotation, translation = start.parameters, start.rotation, start.translation
-    gram, cost = _linearise(lens, parameters, rotation, translation, views, width, cap, with_lens=False)
+    rotation, translation = start.rotation.copy(), start.translation.copy()
+    gram, cost = _linearise(lens, start.parameters, rotation, translation, views, width, cap, with_lens=False)
     damping = np.full(cost.shape, _FIRST_DAMPING)
     raise_by = np.full(cost.shape, 2.0)
-    for _ in range(steps):
-        step = _pose_step(gram, damping)
-        new_rotation, new_translation = _moved(rotation, translation, step)
-        trial, trial_cost = _linearise(
-            lens, parameters, new_rotation, new_translation, views, width, cap, with_lens=False
-        )
-        better = trial_cost < cost
-        gain = cost - trial_cost
-        rotation = np.where(better[..., None, None], new_rotation, rotation)
-        translation = np.where(better[..., None], new_translation, translation)
-        gram = np.where(better[..., None, None], trial, gram)
-        cost = np.where(better, trial_cost, cost)
-        damping, raise_by = _next_damping(better, damping, raise_by)
-        if np.all(~better | (gain < 1e-9 * cost)):
+    settled = np.zeros(cost.shape, dtype=bool)
+    for number in range(steps):
+        if beat is not None and number >= _FAIR_STEPS:
+            settled |= cost > _HOPELESS * beat
+        active = np.flatnonzero(~settled.all(axis=0))
+        if len(active) == 0:
             break
-    return Fit(parameters, rotation, translation, cost.sum(axis=-1)), cost
+        moved = _moved(rotation[:, active], translation[:, active], _pose_step(gram[:, active], damping[:, active]))
+        trial, trial_cost = _linearise(lens, start.parameters, *moved, views.take(active), width, cap, with_lens=False)
+        before = cost[:, active]
+        better = trial_cost < before
+        rotation[:, active] = np.where(better[..., None, None], moved[0], rotation[:, active])
+        translation[:, active] = np.where(better[..., None], moved[1], translation[:, active])
+        gram[:, active] = np.where(better[..., None, None], trial, gram[:, active])
+        cost[:, active] = np.where(better, trial_cost, before)
+        damping[:, active], raise_by[:, active] = _next_damping(better, damping[:, active], raise_by[:, active])
+        small = before - trial_cost < _POSE_RTOL * before
+        settled[:, active] = small & (better | (raise_by[:, active] > _FAILED))
+    return Fit(start.parameters, rotation, translation, cost.sum(axis=-1)), cost
 
 
 def fit_lenses(

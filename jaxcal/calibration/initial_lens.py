@@ -217,7 +217,7 @@ def _better_of_mirrored(lens: Lens, fit: Fit, cost: np.ndarray, views: Views, si
     )
     rotation, translation = mirrored_poses(fit.rotation, fit.translation, middle)
     other = Fit(fit.parameters, rotation, translation, fit.cost)
-    other, other_cost = fit_poses(lens, other, views, steps=_POSE_STEPS, width=_HUBER_PX, cap=0.25 * size)
+    other, other_cost = fit_poses(lens, other, views, steps=_POSE_STEPS, width=_HUBER_PX, cap=0.25 * size, beat=cost)
     swap = other_cost < cost - 1e-9 * np.abs(cost)
     merged = Fit(
         fit.parameters,

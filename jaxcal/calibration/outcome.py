@@ -12,7 +12,8 @@ from jaxcal.calibration.lens_basis import to_parameters
 from jaxcal.calibration.robust import RobustFit, camera_poses
 from jaxcal.calibration.rolling import check_readout
 from jaxcal.calibration.state import RigState, SharedLayout, camera_model_of, transform
-from jaxcal.cameras import CameraModel
+from jaxcal.calibration.view_noise import LEAN, share_of_place
+from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.results import Calibration, CameraCalibration, ImuCalibration, TargetShape
 from jaxcal.targets import Target
@@ -37,6 +38,35 @@ def chain_covariance_and_sentences(
             f"{np.sqrt(inflation):.1f}-fold."
         )
     return covariance * inflation, chain * inflation, sentences
+
+
+# What to try where a lens is too lean for its corners.
+_RICHER = {
+    "pinhole-none": "pinhole-radtan",
+    "pinhole-radtan": "pinhole-radtan5, pinhole-rational8 or, for a wide lens, pinhole-equi",
+    "pinhole-radtan5": "pinhole-rational8",
+    "pinhole-fov": "pinhole-equi or ds-none",
+    "pinhole-division": "pinhole-radtan or pinhole-equi",
+    "omni-none": "omni-radtan",
+    "ds-none": "pinhole-equi or omni-radtan",
+    "eucm-none": "pinhole-equi or omni-radtan",
+}
+
+
+def lens_sentences(
+    fit: RobustFit, names: Sequence[str], models: Sequence[CameraModel], cameras: Sequence[CameraFrames]
+) -> list[str]:
+    """Sentences about lenses that the corners say more of than their models can."""
+    sentences = []
+    for name, model, frames, errors, kept in zip(names, models, cameras, fit.errors, fit.kept, strict=True):
+        share = share_of_place(frames, errors * frames.precision[..., None], kept)
+        if share > LEAN:
+            richer = _RICHER.get(model_name(model), "a splined one (splined-3-12-9-FOV)")
+            sentences.append(
+                f"{name}: {100 * share:.0f} % of its squared errors go by the place in the image, which noise does "
+                f"not: {model_name(model)} is too lean for this lens. Try {richer}."
+            )
+    return sentences
 
 
 def calibration_from(
@@ -107,7 +137,8 @@ def calibration_from(
             "failed, because the recording does not determine the lens, and the optimisation finds no end. "
             + " ".join(open_questions.sentences)
         )
-    sentences = [*open_questions.sentences, *warnings, *outliers.rejection_warnings(names, seen, fit.kept)]
+    lean = lens_sentences(fit, names, models, cameras)
+    sentences = [*open_questions.sentences, *warnings, *lean, *outliers.rejection_warnings(names, seen, fit.kept)]
     if not bool(fit.result.converged):
         reason = ", because the recording leaves parameters open" if open_questions.sentences else ""
         sentences.insert(0, f"The optimisation stopped before it converged{reason}. Do not use this result.")

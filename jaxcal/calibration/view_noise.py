@@ -20,7 +20,7 @@ _TERMS = 6
 _ALIKE = 0.15
 _LARGEST_RATIO = 4.0
 # A lens is too lean when more than this share of the squared residuals goes by the place in the image.
-_LEAN = 0.05
+LEAN = 0.05
 _CELLS = 12  # of the image's longer side
 _FEWEST_IN_CELL = 30
 
@@ -34,7 +34,7 @@ def weigh_views(
     of the points on the board.
     """
     noise = view_noise(errors, kept, places)
-    if share_of_place(frames, errors, kept) < _LEAN:
+    if share_of_place(frames, errors, kept) < LEAN:
         return redundancy, noise
     return spread_over_look_alikes(frames, redundancy, noise), np.ones(len(noise))
 
@@ -77,8 +77,7 @@ def view_noise(errors: np.ndarray, kept: np.ndarray, places: np.ndarray) -> np.n
     told = freedom >= 2 * _TERMS
     if told.sum() < 10:
         return np.ones(count)
-    smooth = _smooth_terms(places)
-    power = np.array([_rest(errors[f][kept[f]], smooth[kept[f]]) if told[f] else 1.0 for f in range(count)])
+    power = _rest(errors, kept, _smooth_terms(places))
     told &= power > 0
     logs = np.log(power[told] / freedom[told])
     chance = 2.0 / freedom[told]
@@ -103,7 +102,12 @@ def _smooth_terms(places: np.ndarray) -> np.ndarray:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
-def _rest(errors: np.ndarray, smooth: np.ndarray) -> float:
-    """Sum of squares of errors (n, 2) less what smooth terms (n, t) explain of them."""
-    q, _ = np.linalg.qr(smooth)
-    return float(np.sum(errors**2) - np.sum((q.T @ errors) ** 2))
+def _rest(errors: np.ndarray, kept: np.ndarray, smooth: np.ndarray) -> np.ndarray:
+    """Sums of squares (F,) of errors (F, N, 2) where they are kept, less what smooth terms (N, t) explain of each."""
+    own = np.where(kept[..., None], errors, 0.0)
+    products = (smooth[:, :, None] * smooth[:, None, :]).reshape(len(smooth), -1)
+    gram = (kept @ products).reshape(-1, smooth.shape[1], smooth.shape[1])
+    force = np.einsum("nt,fnk->ftk", smooth, own)
+    # Few corners, or corners on a line, do not tell all terms apart.
+    explained = np.einsum("ftk,ftk->f", force, np.linalg.pinv(gram, rcond=1e-9, hermitian=True) @ force)
+    return np.sum(own**2, axis=(1, 2)) - explained

@@ -190,3 +190,49 @@ def test_euroc_stereo_and_imu(data_folder: Path) -> None:
     assert np.degrees(turn) < 0.5
     assert np.linalg.norm(T_imu_cam0[:3, 3] - EUROC_T_IMU_CAM0[:3, 3]) < 15e-3
     assert calibration.converged
+
+
+def test_the_halves_of_the_euroc_recording_agree(data_folder: Path) -> None:
+    """Calibrated apart, with a lens that is not too lean, a board that may be bent, and IMU noise re-estimated."""
+    path = data_folder / "euroc_imu_april" / "observations.npz"
+    target = AprilGrid(rows=6, cols=6, tag_size=0.088, tag_spacing=0.3)
+    detections = [load_detections(path, target, (752, 480), name) for name in ("cam0", "cam1")]
+    with np.load(path) as table:
+        noise = ImuNoise(1.6968e-4, 1.9393e-5, 2.0e-3, 3.0e-3)
+        imu = ImuRecording(table["imu_ns"], table["gyro_rad_s"], table["acc_m_s2"], noise)
+    middle = (int(imu.timestamps_ns[0]) + int(imu.timestamps_ns[-1])) // 2
+    one, other = (
+        calibrate_camera_imu(
+            [d.of_frames((d.timestamps_ns >= middle) == second) for d in detections],
+            imu,
+            target,
+            models=["pinhole-radtan5"] * 2,
+            board_warp=True,
+            imu_noise="estimated",
+        )
+        for second in (False, True)
+    )
+    for a, b in zip(one.cameras, other.cameras, strict=True):
+        assert a.T_cam_imu is not None
+        assert b.T_cam_imu is not None
+        assert a.timeshift_cam_imu is not None
+        assert b.timeshift_cam_imu is not None
+        turn = Rotation.from_matrix(b.T_cam_imu[:3, :3] @ a.T_cam_imu[:3, :3].T).as_rotvec()
+        moved = np.linalg.inv(b.T_cam_imu)[:3, 3] - np.linalg.inv(a.T_cam_imu)[:3, 3]
+        shift = b.timeshift_cam_imu - a.timeshift_cam_imu
+        pose = np.concatenate([turn, b.T_cam_imu[:3, 3] - a.T_cam_imu[:3, 3]])
+        combined = [np.hypot(one.std(f"{a.name}.{k}"), other.std(f"{a.name}.{k}")) for k in _PLACE]
+        log.info("%s: %.3f deg, %.2f mm, %.3f ms", a.name, *_norms(turn, moved), 1e3 * shift)
+        assert (np.abs(pose) < 3.0 * combined[0]).all()
+        assert abs(shift) < 3.0 * combined[1][0]
+        # 0.05 deg is wished for; 0.075 and 0.082 deg were seen (1.9 sigma).
+        assert np.degrees(np.linalg.norm(turn)) < 0.1
+        assert np.linalg.norm(moved) < 2e-3
+        assert abs(shift) < 0.2e-3
+
+
+_PLACE = ("T_cam_imu", "timeshift_cam_imu")
+
+
+def _norms(turn: np.ndarray, moved: np.ndarray) -> tuple[float, float]:
+    return float(np.degrees(np.linalg.norm(turn))), float(1e3 * np.linalg.norm(moved))
