@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxcal.calibration.assemble import CameraFrames, split_groups
-from jaxcal.calibration.problem import RigProblem
+from jaxcal.calibration.lens_basis import to_parameters
+from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.robust import RobustFit, corner_errors
-from jaxcal.calibration.state import RigState
+from jaxcal.calibration.state import RigState, SharedLayout
 from jaxcal.calibration.uncertainty import shared_information
-from jaxcal.estimation import BlockArrow, damped_step, single_threaded_blas, solve
+from jaxcal.estimation import BlockArrow, SolveResult, damped_step, single_threaded_blas, solve
 
 logger = logging.getLogger(__name__)
 
@@ -27,6 +28,20 @@ _MOST_RESTARTS = 13
 _ENOUGH, _ENOUGH_BENT = 1, 4
 # Costs that differ by less than this share are one optimum.
 _SAME_COST = 1e-8
+# On bent ground the weakest direction of each lens is walked along, to so many sigmas on both sides, with all else
+# following: two optima of nearly equal cost lie at the ends of a curved valley that no straight step stays in.
+_WALK_SIGMAS = (10.0, 30.0)
+_MOST_WALKS = 4
+# An optimum so many sigmas away is another one; it is as good within three sigmas when it costs no more than this
+# (half of 3 squared) beside.
+_RIVAL_SIGMAS = 3.0
+_AS_GOOD = 4.5
+_AMBIGUOUS = (
+    "Two lenses explain the corners equally well: the optimum has a rival, many sigmas away in the parameters and "
+    "nearly the same in its projections. Do not read the lens' single parameters; record more views, nearer to the rim."
+)
+# How firmly a lens is held on the way, beside what the corners say of it.
+_HOLD = 1e4
 # So far may the cost at the restart exceed what the quadratic model promises; beyond, the start is nonsense (a lens
 # with a pole in the image, say) and moves nearer.
 _BELIEVABLE = 3.0
@@ -37,7 +52,8 @@ def confirm_optimum(fit: RobustFit, cameras: Sequence[CameraFrames], *, max_step
     """Solve again from ten sigmas away; a lower optimum found on the way is taken, and tried in turn.
 
     Where the first restart comes back, that is all. Where not, or where the cost is far from quadratic between, more
-    follow, near and far. Returns the fit to use, and a sentence where restarts do not agree. Deterministic.
+    follow, near and far, and walks along the lenses' weakest directions. Returns the fit to use, and a sentence where
+    restarts do not agree, or where another optimum is as good. Deterministic.
     """
     rng = np.random.default_rng(0)
     agreed, bent, worse = 0, False, None
@@ -60,11 +76,92 @@ def confirm_optimum(fit: RobustFit, cameras: Sequence[CameraFrames], *, max_step
         bent = bent or halved
         if agreed >= (_ENOUGH_BENT if bent else _ENOUGH):
             break
+    sentences = []
+    for walk in range(_MOST_WALKS if bent else 0):
+        lower, rivalled = _along_the_valley(fit, max_steps)
+        sentences = [_AMBIGUOUS] if rivalled else []
+        if lower is None:
+            break
+        logger.info(
+            "walk %d: cost %.9g, from %.9g", walk, float(lower.equations.cost), float(fit.result.equations.cost)
+        )
+        fit = dataclasses.replace(fit, result=lower)
     errors = [np.asarray(e) for e in corner_errors(fit.problem, fit.state)]
     fit = dataclasses.replace(fit, errors=split_groups(fit.problem.layout, cameras, errors))
     if agreed or not bool(fit.result.converged):
-        return fit, []
-    return fit, [_uncertain(float(fit.result.equations.cost), worse)]
+        return fit, sentences
+    return fit, [_uncertain(float(fit.result.equations.cost), worse), *sentences]
+
+
+def _along_the_valley(fit: RobustFit, max_steps: int) -> tuple[SolveResult | None, bool]:
+    """The lowest optimum met from points of the lenses' weakest directions, None where none is below the fit's own; and
+    whether another optimum is as good."""
+    problem, layout = fit.problem, fit.problem.layout
+    free = np.asarray(problem.free)
+    values, directions = shared_information(fit.result.equations, free)
+    if not len(values) or values.min() <= 0:
+        return None, False
+    covariance = np.zeros((len(free), len(free)))
+    covariance[np.ix_(free, free)] = (directions / values) @ directions.T
+    back = to_parameters(problem.basis, layout)
+    if back is not None:
+        covariance = back @ covariance @ back.T
+    best, own_cost, rivalled = None, float(fit.result.equations.cost), False
+    lowest = own_cost
+    for camera in range(layout.num_cameras):
+        own = layout.lens(camera)
+        functional = _weakest(covariance[own, own])
+        if functional is None:
+            continue
+        for side in (1.0, -1.0):
+            state = fit.state
+            for sigmas in _WALK_SIGMAS:
+                held = _held_at(problem, fit.state, camera, functional, side * sigmas)
+                state = solve(held, state, max_steps=max_steps).state
+                released = solve(problem, state, max_steps=max_steps)
+                cost = float(released.equations.cost)
+                if not np.isfinite(cost):
+                    continue
+                away = functional @ (_lens(layout, released.state, camera) - _lens(layout, fit.state, camera))
+                rivalled = rivalled or (abs(away) > _RIVAL_SIGMAS and abs(cost - own_cost) < _AS_GOOD)
+                if cost < lowest * (1.0 - _SAME_COST):
+                    best, lowest = released, cost
+    return best, rivalled
+
+
+def _lens(layout: SharedLayout, state: RigState, camera: int) -> np.ndarray:
+    group, place = layout.place(camera)
+    return np.asarray(state.lenses[group])[place]
+
+
+def _weakest(covariance: np.ndarray) -> np.ndarray | None:
+    """The functional (n,) of a lens' parameters that is known worst for its size, in units of its sigma."""
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    moves = sigma > 0
+    if moves.sum() < 2:
+        return None
+    scaled = covariance[np.ix_(moves, moves)] / np.outer(sigma[moves], sigma[moves])
+    values, vectors = np.linalg.eigh(scaled)
+    functional = np.zeros(len(sigma))
+    functional[moves] = vectors[:, -1] / (np.sqrt(values[-1]) * sigma[moves])
+    return functional
+
+
+def _held_at(problem: RigProblem, state: RigState, camera: int, functional: np.ndarray, value: float) -> RigProblem:
+    """The problem with a lens held where a functional of its parameters is off by `value` from those of `state`; said
+    by its prior, so that no program is compiled anew."""
+    group, place = problem.layout.place(camera)
+    now = _lens(problem.layout, state, camera)
+    information = np.asarray(problem.prior.information[group])[place]
+    mean = np.asarray(problem.prior.mean[group])[place]
+    hold = _HOLD * np.outer(functional, functional)
+    # The sum of both quadratics is one about this mean (least squares: the information may be singular).
+    wanted = information @ mean + _HOLD * functional * (functional @ now + value)
+    middle = np.linalg.lstsq(information + hold, wanted, rcond=None)[0]
+    means, informations = list(problem.prior.mean), list(problem.prior.information)
+    means[group] = means[group].at[place].set(jnp.asarray(middle))
+    informations[group] = informations[group].at[place].set(jnp.asarray(information + hold))
+    return eqx.tree_at(lambda p: p.prior, problem, LensPrior(tuple(means), tuple(informations)))
 
 
 def _uncertain(cost: float, worse: float | None) -> str:

@@ -40,6 +40,16 @@ def test_random_problems_reach_the_optimum_or_say_so(
     assert sum(row.outcome == "optimum" for row in rows) >= 3
 
 
+@pytest.mark.slow
+def test_the_lower_of_two_optima_in_a_curved_valley_is_found_and_its_rival_named(stress: ModuleType) -> None:
+    """A fisheye seen by seven views: two double-sphere lenses twelve sigmas apart, 0.06 apart in cost."""
+    problem = stress.random_problem(np.random.default_rng([1, 4]), "ds-none")
+    row = stress.solve(4, problem)
+    assert row.outcome == "optimum"
+    assert row.cost <= row.cost_from_truth * (1.0 + 1e-9)
+    assert "rival" in row.message
+
+
 def test_the_same_number_gives_the_same_problem_and_the_table_counts_it(stress: ModuleType, tmp_path: Path) -> None:
     first, second = (stress.random_problem(np.random.default_rng([3, 1]), "pinhole-none") for _ in range(2))
     np.testing.assert_array_equal(first.frames.pixels, second.frames.pixels)
