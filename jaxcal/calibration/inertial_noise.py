@@ -18,8 +18,8 @@ from jaxcal.calibration.state import RigState
 _CLEARLY_CORRELATED = 0.05
 # Noise below this share of the stated one is not believed: the spline would have followed it.
 _SMALLEST_RATIO = 0.02
-# The round of `robust_fit` that takes correlations into account: the first one without robust loss.
-_CORRELATED = 3
+# The round of `robust_fit` from which correlations count: the third, which starts from a settled trajectory.
+_CORRELATED = 2
 
 NoiseChoice = Literal["at least given", "given", "estimated"]
 
@@ -68,9 +68,9 @@ class NoiseModel:
         """Noise as the residuals show it (never below the stated one unless that is asked for), and samples binned anew
         where the clocks have moved.
 
-        How long residuals hang together is seen once, in round _CORRELATED, while they have their full say: an IMU that
-        counts for little is left with the errors of the cameras' trajectory, which hang together for longer, and would
-        come to count for less and less.
+        How long residuals hang together is asked from round _CORRELATED on, when all has settled while the IMU had its
+        full say. An IMU that counts for little too early is left with the errors of the cameras' trajectory, which hang
+        together for longer, and comes to count for less and less.
         """
         assert problem.imu is not None
         samples = list(problem.imu.samples)
@@ -78,11 +78,9 @@ class NoiseModel:
             stated = self.binned[i].at_shift(self.grid, float(state.imu_shift[i])).samples
             if self.choice == "given":
                 ratio = np.ones(2)
-            elif stage > _CORRELATED:
-                ratio = np.asarray(stated.inverse_sigma / samples[i].inverse_sigma)[[0, 3]]
             else:
                 ratio = self._ratio(problem, state, i)
-                if stage == _CORRELATED:
+                if stage >= _CORRELATED:
                     ratio = ratio * self._hanging_together(problem, state, i)
             ratio = np.maximum(ratio, 1.0 if self.choice == "at least given" else _SMALLEST_RATIO)
             inverse = stated.inverse_sigma / jnp.asarray(np.repeat(ratio, 3))
