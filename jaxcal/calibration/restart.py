@@ -123,7 +123,7 @@ def _along_the_valley(fit: RobustFit, max_steps: int) -> tuple[SolveResult | Non
                 if not np.isfinite(cost):
                     continue
                 away = functional @ (_lens(layout, released.state, camera) - _lens(layout, fit.state, camera))
-                rivalled = rivalled or (abs(away) > _RIVAL_SIGMAS and abs(cost - own_cost) < _AS_GOOD)
+                rivalled = rivalled or bool(abs(away) > _RIVAL_SIGMAS and abs(cost - own_cost) < _AS_GOOD)
                 if cost < lowest * (1.0 - _SAME_COST):
                     best, lowest = released, cost
     return best, rivalled

@@ -68,8 +68,9 @@ def calibrate(
         calibration:                      # arguments of the job, as in Python
           intrinsics: prior               # with an IMU: free, prior or held, and the calibration they come from
           cameras: earlier/camchain.yaml
-          imu_noise: estimated            # also gravity_magnitude, spline_order, knot_rate_hz, max_steps
-          # without an IMU: views, board_warp, point_offset_sigma_m, time_offsets, sync_tolerance_s, loss
+          imu_noise: estimated            # also gravity_magnitude, spline_order, knot_rate_hz
+          board_warp: true                # the board is bent; also point_offset_sigma_m, loss, max_steps
+          # without an IMU: views, time_offsets, sync_tolerance_s
 
     The folder gets report.html (look there first), Kalibr's camchain and imu.yaml, results.txt and calibration.npz,
     which holds everything. Reconstructed frames and corners are kept in .jaxcal/ beside RIG.yaml: a run that was

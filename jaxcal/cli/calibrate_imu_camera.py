@@ -58,6 +58,8 @@ _NOT_NEEDED = all_of(
     type=click.Choice(["held", "prior", "free"]),
     help="Lenses of --cams: held as Kalibr does (default), under their own uncertainty, or only a start.",
 )
+@click.option("--board-warp", is_flag=True, help="Estimate how the board is bent.")
+@click.option("--imu-noise-estimated", is_flag=True, help="Use the noise that the residuals show, not imu.yaml's.")
 @click.option("--bag-from-to", nargs=2, type=float, metavar="START END", help="Use this part only; s after the start.")
 @click.option("--bag-freq", type=float, help="Use at most so many images a second.")
 @click.option("--rolling-shutter", is_flag=True, help="Rows are seen one after another: estimate the delay.")
@@ -105,6 +107,8 @@ def calibrate_imu_camera(ctx: click.Context, bag: Path, target_file: Path, out: 
     topics = _topics(ctx, chain, earlier, given)
     rig, imu_topics = _rig(bag, target_file, topics, earlier, given)
     options: dict[str, Any] = {} if given["max_iter"] is None else {"max_steps": given["max_iter"]}
+    options |= {"board_warp": True} if given["board_warp"] else {}
+    options |= {"imu_noise": "estimated"} if given["imu_noise_estimated"] else {}
     if earlier is not None:
         options |= {"cameras": earlier, "intrinsics": given["intrinsics"] or "held"}
     settings = PipelineSettings(cache=out / "cache", camera_imu=options)
