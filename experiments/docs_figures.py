@@ -131,7 +131,9 @@ def gyroscope(course: Path) -> Figure:
 def of_report(course: Path, title: str) -> str:
     """A figure of the report, on white paper."""
     calibration = jaxcal.load_calibration(course / "out")
-    pictures = camera_pictures(calibration, calibration.cameras[0], "docs")
+    camera = calibration.cameras[0]
+    projection = projection_uncertainty(calibration, camera.name)
+    pictures = camera_pictures(camera, calibration.target, projection, "docs")
     found = {picture.title: picture.svg for picture in pictures}
     if title not in found:
         raise jaxcal.CalibrationError(f"the report has no figure '{title}'; it has {', '.join(found)}.")

@@ -5,12 +5,13 @@
 
 A code block is run where `<!-- output -->` follows it; what stands between that and `<!-- /output -->` is replaced by
 what it printed, or by a part: `<!-- output: from "verdict" lines 3 -->`. Pages share one folder and build on
-those before them. Whole, they take some ten minutes. `docs_figures.py` then draws the figures.
+those before them; the first one begins with an empty folder. Whole, they take some ten minutes. `docs_figures.py` then draws the figures.
 """
 
 import argparse
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -39,6 +40,8 @@ def main() -> int:
     if "JAXCAL_DATA" not in os.environ:
         print("error: set JAXCAL_DATA to the folder of real recordings.", file=sys.stderr)
         return 1
+    if names[0] in chosen.only:
+        shutil.rmtree(chosen.work, ignore_errors=True)
     chosen.work.mkdir(parents=True, exist_ok=True)
     for name in chosen.only:
         page = PAGES / f"{name}.md"
@@ -54,8 +57,7 @@ def main() -> int:
 
 def run(kind: str, code: str, folder: Path) -> str:
     """What a block prints, with the places of this machine left out. Raises RuntimeError when it fails."""
-    # `pipefail` is not set: the status of a command whose output is cut short by `head` does not matter.
-    command = ["bash", "-ec", code] if kind == "bash" else [sys.executable, "-c", code]
+    command = ["bash", "-eo", "pipefail", "-c", code] if kind == "bash" else [sys.executable, "-c", code]
     environment = os.environ | {"JAXCAL_DATA": str(Path(os.environ["JAXCAL_DATA"]).resolve())}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     if done.returncode not in _ACCEPTED:

@@ -28,7 +28,7 @@ def report(result: Path, sources: tuple[str, ...], out: Path | None) -> None:
     from jaxcal.cli.progress_bars import ProgressBars
     from jaxcal.errors import CalibrationError
     from jaxcal.recording import load_frames
-    from jaxcal.results import judge, load_calibration, load_cross_validation, write_report
+    from jaxcal.results import load_calibration, load_cross_validation, write_report
 
     calibration = load_calibration(result)
     names = [camera.name for camera in calibration.cameras]
@@ -43,6 +43,7 @@ def report(result: Path, sources: tuple[str, ...], out: Path | None) -> None:
     folder = result if result.is_dir() else result.parent
     path = out or folder / "report.html"
     with ProgressBars() as bars:
-        write_report(calibration, path, images=images, progress=bars, cross_validation=load_cross_validation(folder))
-    click.echo(judge(calibration).headline)
+        found = load_cross_validation(folder)
+        verdict = write_report(calibration, path, images=images, progress=bars, cross_validation=found)
+    click.echo(verdict.headline)
     click.echo(f"report: {path.resolve()}")

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import scipy.ndimage
 
 from jaxcal.progress import Progress, no_progress
 from jaxcal.recording.events import EventFile
@@ -206,7 +205,9 @@ def _facts(events: EventFile, tally: _Tally) -> EventFacts:
 def _hot_pixels(activity: np.ndarray) -> tuple[HotPixel, ...]:
     if not activity.size:
         return ()
-    around = scipy.ndimage.median_filter(activity, size=5, mode="reflect")
+    from scipy.ndimage import median_filter  # takes long to import, and few need it
+
+    around = median_filter(activity, size=5, mode="reflect")
     hot = (activity >= _HOT_COUNT) & (activity > _HOT_TO_NEIGHBOURS * around)
     hot &= activity > _HOT_TO_MEAN * activity.mean()
     found = [HotPixel(int(x), int(y), int(activity[y, x])) for y, x in np.argwhere(hot)]

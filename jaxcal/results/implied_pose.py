@@ -19,9 +19,8 @@ from jaxtyping import Array, Float
 from scipy.optimize import least_squares
 
 from jaxcal.cameras import CameraModel
+from jaxcal.results.rays import rays_through
 
-# A ray that projects further than this from its pixel (px) is not the pixel's: it lies outside the lens's domain.
-_MISSED_PX = 1e-3
 # Differences beyond this multiple of their median count less: where a lens was not seen it may be anywhere.
 _SOFT = 3.0
 
@@ -47,15 +46,16 @@ def implied_difference(
     `weight` (R, K) multiplies differences, 1 / sigma, 0 or NaN: not to be fitted. With directions alone the move is a
     turn. Ranges of weight zero take no part in the fit but are told.
     """
-    rays, valid = rays_through(first, jnp.asarray(pixels))
+    rays, valid = rays_through(first, pixels)
     inverse = np.array([0.0 if np.isinf(r) else 1.0 / r for r in ranges_m])
-    valid = np.asarray(valid)
     weight = np.where(valid & np.isfinite(weight), weight, 0.0)
     fitted = weight.any(axis=1)
     free = np.arange(6) < (6 if inverse[fitted].any() else 3)
 
     def moved_by(vector: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
-        return tuple(np.asarray(part) for part in _moved(second, rays, jnp.asarray(inverse[k]), jnp.asarray(vector)))
+        return tuple(
+            np.asarray(part) for part in _moved(second, jnp.asarray(rays), jnp.asarray(inverse[k]), jnp.asarray(vector))
+        )
 
     def at(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Weighted residuals (N,) and Jacobian (N, 6) of the ranges that are fitted."""
@@ -102,14 +102,6 @@ def _fit(at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], free: np.nda
         return whole(first)
     scale = _SOFT * float(np.median(used))
     return whole(least_squares(residuals, first, jacobian, x_scale="jac", loss="soft_l1", f_scale=scale).x)
-
-
-@eqx.filter_jit
-def rays_through(model: CameraModel, pixels: Float[Array, "K 2"]) -> tuple[Array, Array]:
-    """Unit rays (K, 3) of a lens through pixels, and whether each is a ray of that pixel in the lens's domain (K,)."""
-    rays = model.unproject(pixels)
-    missed = jnp.linalg.norm(model.project(rays) - pixels, axis=-1)
-    return rays, jax.vmap(model.is_valid)(rays) & (missed < _MISSED_PX)
 
 
 @eqx.filter_jit

@@ -24,12 +24,11 @@ from jaxtyping import Array, Float
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
 from jaxcal.results.calibration import Calibration, CameraCalibration
+from jaxcal.results.rays import rays_through
 
 DEFAULT_GRID = (60, 40)
 # Numbers of corners are rounded up to a multiple of this power of two, so that few programs are compiled.
 _CORNER_STEP = 4096
-# A ray that projects further than this from its pixel (px) is not the pixel's: it lies outside the lens's domain.
-_MISSED_PX = 1e-3
 # Fewer corners than this do not fix a pose.
 _FEWEST_CORNERS = 4
 
@@ -129,13 +128,14 @@ def projection_covariance(
     count = -(-len(corners) // _CORNER_STEP) * _CORNER_STEP
     padded = np.concatenate([corners, np.tile([[0.0, 0.0, 1.0]], (count - len(corners), 1))])
     inverse_range = 0.0 if range_m is None else 1.0 / range_m
-    normal, right, of_lens, of_pose, valid = (
+    rays, valid = rays_through(chosen.model, pixels)
+    normal, right, of_lens, of_pose = (
         np.asarray(part)
         for part in _sensitivities(
             chosen.model,
             jnp.asarray(padded),
             jnp.asarray(np.pad(weight, (0, count - len(corners)))),
-            jnp.asarray(pixels, dtype=float),
+            jnp.asarray(rays),
             jnp.asarray(inverse_range),
         )
     )
@@ -167,11 +167,10 @@ def _sensitivities(
     model: CameraModel,
     corners: Float[Array, "M 3"],
     weight: Float[Array, " M"],
-    pixels: Float[Array, "K 2"],
+    rays: Float[Array, "K 3"],
     inverse_range: Float[Array, ""],
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Weighted sums over the corners: B'B (6, 6) and B'A (6, n); at the pixels: A (K, 2, n), B (K, 2, 6), and whether
-    the pixel has a ray (K,)."""
+) -> tuple[Array, Array, Array, Array]:
+    """Weighted sums over the corners: B'B (6, 6) and B'A (6, n); on the rays: A (K, 2, n) and B (K, 2, 6)."""
     parameters = model.parameters
 
     def project(vector: Array, point: Array) -> Array:
@@ -183,12 +182,9 @@ def _sensitivities(
     # B'A without A, which is large for splined lenses: six vector-Jacobian products over all corners at once.
     _, pull = jax.vjp(lambda vector: jax.vmap(lambda point: project(vector, point))(corners), parameters)
     right = jax.vmap(lambda column: pull(column)[0])(jnp.moveaxis(weighted, -1, 0))
-    rays = model.unproject(pixels)
     A = jax.vmap(lambda ray: jax.jacrev(project)(parameters, ray))(rays)
     B_there = jax.vmap(lambda ray: _pose_jacobian(model, ray, inverse_range))(rays)
-    missed = jnp.linalg.norm(model.project(rays) - pixels, axis=-1)
-    valid = jax.vmap(model.is_valid)(rays) & (missed < _MISSED_PX)
-    return normal, right, A, B_there, valid
+    return normal, right, A, B_there
 
 
 def _pose_jacobian(

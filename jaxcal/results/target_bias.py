@@ -1,5 +1,6 @@
 """Systematic residuals of single target points: a board that is not what target.yaml says, or a biased detector."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from jaxcal.targets import Target
 
 _FEWEST_IN_FRAME = 6  # for the affine map of a frame
 _FEWEST_FOR_MEAN = 5
+_FLATTEST = 1e-6  # points of a frame that lie on a line tell no map: their spread across it over that along it
 
 
 @dataclass(frozen=True)
@@ -49,18 +51,25 @@ def _turned_residuals(camera: CameraCalibration, plane: np.ndarray) -> tuple[np.
     used = camera.used
     frame, point = camera.detections.frame[used], camera.detections.point[used]
     pixels, residuals = camera.detections.pixels[used], camera.residuals_px[used]
-    turned, points = [np.zeros((0, 2))], [np.zeros(0, dtype=np.int64)]
-    starts = np.flatnonzero(np.diff(frame, prepend=-1))  # detections are in order of frames
-    stops = np.append(starts, len(frame))[1:]
-    for start, stop in zip(starts, stops, strict=True):
-        rows = slice(start, stop)
-        ground = plane[point[rows]] - plane[point[rows]].mean(axis=0)
-        if stop - start < _FEWEST_IN_FRAME or np.linalg.matrix_rank(ground, tol=1e-9) < 2:
-            continue
-        affine = np.linalg.lstsq(ground, pixels[rows] - pixels[rows].mean(axis=0), rcond=None)[0].T
-        size = np.sqrt(abs(np.linalg.det(affine)))
-        if not size > 1e-9:
-            continue
-        turned.append(size * np.linalg.solve(affine, residuals[rows].T).T)
-        points.append(point[rows])
-    return np.concatenate(turned), np.concatenate(points)
+    _, row, count = np.unique(frame, return_inverse=True, return_counts=True)
+
+    def sums(values: np.ndarray) -> np.ndarray:
+        """Over the corners of each frame (F, ...), of values (M, ...)."""
+        flat = values.reshape(len(values), math.prod(values.shape[1:]))
+        added = [np.bincount(row, weights=column, minlength=len(count)) for column in flat.T]
+        return np.stack(added, axis=-1).reshape(len(count), *values.shape[1:])
+
+    means = count[:, None]
+    ground = plane[point] - (sums(plane[point]) / means)[row]
+    image = pixels - (sums(pixels) / means)[row]
+    # Least squares of all frames at once, by their normal equations: pixels = affine @ ground.
+    normal = sums(ground[:, :, None] * ground[:, None, :])
+    spread = np.linalg.eigvalsh(normal)
+    sound = (count >= _FEWEST_IN_FRAME) & (spread[:, 0] > _FLATTEST**2 * spread[:, 1])
+    safe = np.where(sound[:, None, None], normal, np.eye(2))
+    affine = np.linalg.solve(safe, sums(ground[:, :, None] * image[:, None, :])).swapaxes(1, 2)
+    size = np.sqrt(np.abs(np.linalg.det(affine)))
+    sound &= size > 1e-9
+    kept = sound[row]
+    safe = np.where(sound[:, None, None], affine, np.eye(2))[row[kept]]
+    return size[row[kept], None] * np.linalg.solve(safe, residuals[kept, :, None])[..., 0], point[kept]

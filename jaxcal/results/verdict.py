@@ -1,7 +1,7 @@
 """The verdict: whether a calibration can be used, from checks that each state what was measured and what is wanted."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,7 +10,7 @@ import numpy as np
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
 from jaxcal.results.coverage import coverage, least_kept
 from jaxcal.results.parameters import camera_estimates, sigma_of, timeshift_estimate
-from jaxcal.results.projection_uncertainty import can_be_told, projection_uncertainty
+from jaxcal.results.projection_uncertainty import ProjectionUncertainty, can_be_told, projection_uncertainty
 from jaxcal.results.target_bias import target_bias
 from jaxcal.targets import Target
 
@@ -68,9 +68,12 @@ class Verdict:
         return tuple(sorted((c for c in self.checks if c.level != "good"), key=lambda c: _severity(c.level)))
 
 
-def judge(calibration: Calibration) -> Verdict:
-    """Check a calibration for what makes results unusable or weak. Warnings alone make it usable with care."""
-    checks = tuple(_checks(calibration))
+def judge(calibration: Calibration, projections: Mapping[str, ProjectionUncertainty] | None = None) -> Verdict:
+    """Check a calibration for what makes results unusable or weak. Warnings alone make it usable with care.
+
+    `projections`: the cameras' projection uncertainties, by name, where they are known already (at infinity).
+    """
+    checks = tuple(_checks(calibration, projections or {}))
     failed = sorted((check for check in checks if check.level != "good"), key=lambda check: _severity(check.level))
     problems = [check.problem for check in failed] + [_clause(warning) for warning in calibration.warnings]
     if not problems:
@@ -115,14 +118,14 @@ def _below(value: float, limits: tuple[float, float]) -> Level:
     return "usable" if value < limits[0] else "good"
 
 
-def _checks(calibration: Calibration) -> Iterator[Check]:
+def _checks(calibration: Calibration, projections: Mapping[str, ProjectionUncertainty]) -> Iterator[Check]:
     yield from _solution_checks(calibration)
     for index, camera in enumerate(calibration.cameras):
         yield from _residual_checks(camera)
         yield from _target_checks(camera, calibration.target)
         yield from _view_checks(camera)
         yield from _lens_checks(calibration, index)
-        yield from _projection_checks(calibration, camera)
+        yield from _projection_checks(calibration, camera, projections.get(camera.name))
         yield from _pose_checks(calibration, camera)
         yield from _time_checks(calibration, index)
     for number, imu in enumerate(calibration.imus):
@@ -269,10 +272,13 @@ def _lens_checks(calibration: Calibration, index: int) -> Iterator[Check]:
         )
 
 
-def _projection_checks(calibration: Calibration, camera: CameraCalibration) -> Iterator[Check]:
-    if not can_be_told(calibration, camera):
-        return
-    found = projection_uncertainty(calibration, camera.name)
+def _projection_checks(
+    calibration: Calibration, camera: CameraCalibration, found: ProjectionUncertainty | None
+) -> Iterator[Check]:
+    if found is None:
+        if not can_be_told(calibration, camera):
+            return
+        found = projection_uncertainty(calibration, camera.name)
     scale = max(1.0, camera.image_size[0] / 2000.0)
     yield Check(
         camera.name,

@@ -3,8 +3,9 @@
 import numpy as np
 from matplotlib.patches import Circle, Rectangle
 
-from jaxcal.results.calibration import Calibration, CameraCalibration
+from jaxcal.results.calibration import CameraCalibration
 from jaxcal.results.coverage import corner_counts, coverage
+from jaxcal.results.projection_uncertainty import ProjectionUncertainty
 from jaxcal.results.report.drawing import (
     ACCENT,
     BAD,
@@ -31,15 +32,17 @@ _FEWEST_FOR_MEAN = 4
 _RADIUS_BINS = 12
 
 
-def camera_pictures(calibration: Calibration, camera: CameraCalibration, prefix: str) -> list[Picture]:
+def camera_pictures(
+    camera: CameraCalibration, target: Target, projection: ProjectionUncertainty | None, prefix: str
+) -> list[Picture]:
     """All figures of a camera, in the order in which they are read; `prefix` is unique in the page."""
     return [
         _coverage_picture(camera, f"{prefix}-coverage"),
         lens_picture(camera, f"{prefix}-lens"),
-        projection_picture(calibration, camera, f"{prefix}-projection"),
+        projection_picture(camera, projection, f"{prefix}-projection"),
         _scatter_picture(camera, f"{prefix}-scatter"),
         _field_picture(camera, f"{prefix}-field"),
-        _target_picture(camera, calibration.target, f"{prefix}-target"),
+        _target_picture(camera, target, f"{prefix}-target"),
         _radial_picture(camera, f"{prefix}-radial"),
         _frames_picture(camera, f"{prefix}-frames"),
     ]

@@ -1,7 +1,6 @@
 """The figure of a lens: the angle at which each pixel looks, and where a straight lens would have put it."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from matplotlib.axes import Axes
@@ -9,7 +8,7 @@ from matplotlib.ticker import FuncFormatter
 
 from jaxcal.cameras import CameraModel
 from jaxcal.results.calibration import CameraCalibration
-from jaxcal.results.implied_pose import rays_through
+from jaxcal.results.rays import rays_through
 from jaxcal.results.report.drawing import ACCENT, INK, MUTED, Picture, image_panel, note, nothing_to_show, to_svg
 
 _GRID = (48, 36)
@@ -61,7 +60,7 @@ def _looked(camera: CameraCalibration) -> tuple[np.ndarray, np.ndarray, np.ndarr
     width, height = camera.image_size
     nx, ny = _GRID
     pixels = np.stack(np.meshgrid(np.linspace(0, width - 1.0, nx), np.linspace(0, height - 1.0, ny)), axis=-1)
-    rays, valid = (np.asarray(part) for part in rays_through(camera.model, jnp.asarray(pixels.reshape(-1, 2))))
+    rays, valid = rays_through(camera.model, pixels.reshape(-1, 2))
     valid = valid & np.isfinite(rays).all(axis=1)
     angle = np.where(valid, np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]), np.nan)
     scale, centre = (np.asarray(part) for part in _paraxial(camera.model))

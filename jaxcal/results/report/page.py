@@ -15,6 +15,7 @@ from jaxcal.progress import Progress, no_progress
 from jaxcal.results.advice import advice
 from jaxcal.results.calibration import Calibration
 from jaxcal.results.cross_validation import CrossValidation
+from jaxcal.results.projection_uncertainty import can_be_told, projection_uncertainty
 from jaxcal.results.report.camera_figures import camera_pictures
 from jaxcal.results.report.cross_validation_section import cross_validation_section
 from jaxcal.results.report.drawing import ACCENT, Picture, label, nothing_to_show, panel, to_svg
@@ -24,7 +25,7 @@ from jaxcal.results.report.rig_figures import rig_pictures
 from jaxcal.results.report.rig_scene import rig_scene
 from jaxcal.results.report.tables import camera_tables, check_rows, gravity_table, imu_facts
 from jaxcal.results.report.time_figure import time_picture
-from jaxcal.results.verdict import judge
+from jaxcal.results.verdict import Verdict, judge
 
 
 def write_report(
@@ -33,17 +34,19 @@ def write_report(
     images: Mapping[str, Frames] | None = None,
     progress: Progress = no_progress,
     cross_validation: CrossValidation | None = None,
-) -> None:
+) -> Verdict:
     """Write the report of a calibration to `path`, atomically, as a single HTML file without external references.
 
     `images` are the frames in which the corners of a camera were found, by camera name; cameras without them are
     reported without pictures of their detections. A `cross_validation` of this calibration gets a section of its own.
-    Raises CalibrationError when an image has not its camera's size.
+    Returns the verdict that the report opens with. Raises CalibrationError when an image has not its camera's size.
     """
     stage = "report"
     total = len(calibration.cameras) + 1
     cameras = []
     progress(stage, 0, total)
+    told = [camera for camera in calibration.cameras if can_be_told(calibration, camera)]
+    projections = {camera.name: projection_uncertainty(calibration, camera.name) for camera in told}
     for index, camera in enumerate(calibration.cameras):
         frames: list[FramePicture] = []
         if images is not None and camera.name in images:
@@ -53,19 +56,20 @@ def write_report(
                 "id": f"camera-{index}",
                 "tables": camera_tables(calibration, index),
                 "frames": frames,
-                "pictures": camera_pictures(calibration, camera, f"c{index}"),
+                "pictures": camera_pictures(camera, calibration.target, projections.get(camera.name), f"c{index}"),
             }
         )
         progress(stage, index + 1, total)
     cross = None if cross_validation is None else cross_validation_section(cross_validation)
-    page = _template().render(**_content(calibration), cameras=cameras, cross=cross)
+    verdict = judge(calibration, projections)
+    page = _template().render(**_content(calibration, verdict), cameras=cameras, cross=cross)
     write_text(Path(path), page)
     progress(stage, total, total)
+    return verdict
 
 
-def _content(calibration: Calibration) -> dict[str, Any]:
+def _content(calibration: Calibration, verdict: Verdict) -> dict[str, Any]:
     imu = calibration.imu
-    verdict = judge(calibration)
     names = tuple(camera.name for camera in calibration.cameras)
     others = tuple(dict.fromkeys(check.subject for check in verdict.checks if check.subject not in names))
     is_rig = imu is not None or len(calibration.cameras) > 1

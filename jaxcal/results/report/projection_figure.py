@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib.ticker import FuncFormatter
 
-from jaxcal.results.calibration import Calibration, CameraCalibration
-from jaxcal.results.projection_uncertainty import can_be_told, projection_uncertainty
+from jaxcal.results.calibration import CameraCalibration
+from jaxcal.results.projection_uncertainty import ProjectionUncertainty
 from jaxcal.results.report.drawing import ACCENT, INK, POINT, WARN, Picture, image_panel, nothing_to_show, to_svg
 
 # Contours at 1, 2, 5 times powers of ten, px; so many of them at most, the lowest first.
@@ -12,11 +12,10 @@ _LEVELS = np.outer(10.0 ** np.arange(-4, 5), [1.0, 2.0, 5.0]).ravel()
 _MOST_LEVELS = 8
 
 
-def projection_picture(calibration: Calibration, camera: CameraCalibration, prefix: str) -> Picture:
-    """Contours of the 1-sigma of a projected point at infinity; `prefix` is unique in the page."""
+def projection_picture(camera: CameraCalibration, found: ProjectionUncertainty | None, prefix: str) -> Picture:
+    """Contours of the 1-sigma of a projected point at infinity (None: not known); `prefix` is unique in the page."""
     figure, axes = image_panel(camera.image_size)
-    if can_be_told(calibration, camera):
-        found = projection_uncertainty(calibration, camera.name)
+    if found is not None:
         x, y = found.pixels[0, :, 0], found.pixels[:, 0, 1]
         if not found.observed.all():
             axes.contourf(x, y, ~found.observed, levels=[0.5, 1.5], colors=[WARN], alpha=0.22)

@@ -1,13 +1,10 @@
 """The figures of the rig: where the cameras and the IMU sit, and how they moved before the target."""
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 
-from jaxcal.cameras import CameraModel
 from jaxcal.results.calibration import Calibration, CameraCalibration, ImuCalibration
+from jaxcal.results.rays import rays_through
 from jaxcal.results.report.drawing import (
     ACCENT,
     AXIS_COLOURS,
@@ -106,14 +103,9 @@ def _name(axes: Axes, text: str, at: np.ndarray, above: bool = False) -> None:
 def rim_rays(camera: CameraCalibration) -> np.ndarray:
     """Unit rays (4, 3) through the corners of the image, camera frame; zero where the model has none."""
     width, height = camera.image_size
-    corners = jnp.array([[0.0, 0.0], [width - 1.0, 0.0], [width - 1.0, height - 1.0], [0.0, height - 1.0]])
-    rays = np.asarray(_unproject(camera.model, corners))
+    corners = np.array([[0.0, 0.0], [width - 1.0, 0.0], [width - 1.0, height - 1.0], [0.0, height - 1.0]])
+    rays, _ = rays_through(camera.model, corners)
     return np.where(np.isfinite(rays), rays, 0.0)
-
-
-@eqx.filter_jit
-def _unproject(model: CameraModel, pixels: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
-    return model.unproject(pixels)
 
 
 def frustum(rim: np.ndarray) -> list[np.ndarray]:

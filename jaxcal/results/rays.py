@@ -1,0 +1,29 @@
+"""Rays of a lens through pixels, by one compiled program for all that ask for them."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxcal.cameras import CameraModel
+
+# A ray that projects further than this from its pixel (px) is not the pixel's: it lies outside the lens's domain.
+_MISSED_PX = 1e-3
+# Numbers of pixels are rounded up to a multiple of this: tracing an unprojection takes longer than doing it.
+_STEP = 2560
+
+
+def rays_through(model: CameraModel, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit rays (K, 3) of a lens through pixels (K, 2), and whether each is its pixel's, in the lens's domain (K,)."""
+    count = -(-max(len(pixels), 1) // _STEP) * _STEP
+    padded = np.pad(np.asarray(pixels, dtype=np.float64), ((0, count - len(pixels)), (0, 0)), mode="edge")
+    rays, valid = _rays_through(model, jnp.asarray(padded))
+    return np.asarray(rays)[: len(pixels)], np.asarray(valid)[: len(pixels)]
+
+
+@eqx.filter_jit
+def _rays_through(model: CameraModel, pixels: Float[Array, "K 2"]) -> tuple[Array, Array]:
+    rays = model.unproject(pixels)
+    missed = jnp.linalg.norm(model.project(rays) - pixels, axis=-1)
+    return rays, jax.vmap(model.is_valid)(rays) & (missed < _MISSED_PX)
