@@ -4,8 +4,9 @@
     JAXCAL_DATA=path/to/recordings python experiments/docs_outputs.py --only 5_judge 6_extend
 
 A code block is run where `<!-- output -->` follows it; what stands between that and `<!-- /output -->` is replaced by
-what it printed, or by a part: `<!-- output: from "verdict" lines 3 -->`. Pages share one folder and build on
-those before them; the first one begins with an empty folder. Whole, they take some ten minutes. `docs_figures.py` then draws the figures.
+what it printed, or by a part: `<!-- output: from "verdict" lines 3 -->`. Pages share one folder and build on those
+before them; the first one begins with an empty folder. Whole, they take some ten minutes. `docs_figures.py` then draws
+the figures.
 """
 
 import argparse
