@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from jaxcal.cli.outcome import EXIT_CODES
+from jaxcal.cli.outcome import EXIT_CODES, RERUN_FILE
 
 
 @click.command(epilog=EXIT_CODES)
@@ -24,6 +24,7 @@ from jaxcal.cli.outcome import EXIT_CODES
 @click.option(
     "--cross-validate", is_flag=True, help="Cross-validate the result, too, for the report; see that command."
 )
+@click.option("--rerun", type=RERUN_FILE, help="Write a log for the Rerun viewer, too: out.rrd (jaxcal[rerun]).")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 @click.pass_context
 def calibrate(
@@ -34,6 +35,7 @@ def calibrate(
     workers: int | None,
     report: bool,
     cross_validate: bool,
+    rerun: Path | None,
     as_json: bool,
 ) -> None:
     """Calibrate the cameras, event cameras and IMUs that a rig.yaml names, jointly.
@@ -80,12 +82,17 @@ def calibrate(
     from jaxcal.cli.progress_bars import ProgressBars
     from jaxcal.pipeline import PipelineSettings, run_pipeline
     from jaxcal.results import load_cross_validation
+    from jaxcal.results.rerun_file import require_rerun, write_rerun
 
+    if rerun is not None:
+        require_rerun(rerun)
     settings = PipelineSettings(report=report, cross_validate=cross_validate)
     if window_ms is not None:
         settings = replace(settings, window_ms=window_ms)
     with ProgressBars() as bars:
         calibration = run_pipeline(rig, output, settings=settings, workers=workers, progress=bars)
+    if rerun is not None:
+        write_rerun(calibration, rerun)
     truth = rig.parent / "ground_truth.yaml"
     found = load_cross_validation(output) if cross_validate else None
     status = show_calibration(calibration, output, as_json=as_json, ground_truth=truth, cross_validation=found)

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 # Exit codes of all commands; click itself ends in 2 when a command is used wrongly.
 FINE, IMPOSSIBLE, MISUSED, NOT_GOOD = 0, 1, 2, 3
 
+# What --rerun takes.
+RERUN_FILE = click.Path(dir_okay=False, path_type=Path)
+
 EXIT_CODES = (
     "Exit codes: 0 fine; 1 the input makes it impossible, said on stderr; 2 wrong usage; 3 there is a result, "
     "but the verdict is 'do not use'."

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import click
 
+from jaxcal.cli.outcome import RERUN_FILE
+
 
 @click.command()
 @click.argument("result", type=click.Path(path_type=Path))
@@ -15,12 +17,14 @@ import click
     help="Pictures of a camera, to show its corners on: cam0=left/; may be repeated.",
 )
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="File to write (RESULT/report.html).")
-def report(result: Path, sources: tuple[str, ...], out: Path | None) -> None:
+@click.option("--rerun", type=RERUN_FILE, help="Write a log for the Rerun viewer, too: out.rrd (jaxcal[rerun]).")
+def report(result: Path, sources: tuple[str, ...], out: Path | None, rerun: Path | None) -> None:
     """Write the report of a saved calibration, one HTML page that needs nothing else.
 
     \b
     jaxcal report result/
     jaxcal report result/ --images cam0=left/ --images cam1=right/ --out for_the_lab.html
+    jaxcal report result/ --rerun result.rrd && rerun result.rrd
 
     RESULT is a folder of jaxcal's, or its calibration.npz. A calibration does not hold pictures: without --images the
     page shows none. What `jaxcal cross-validate RESULT` found is shown, too.
@@ -29,7 +33,10 @@ def report(result: Path, sources: tuple[str, ...], out: Path | None) -> None:
     from jaxcal.errors import CalibrationError
     from jaxcal.recording import load_frames
     from jaxcal.results import load_calibration, load_cross_validation, write_report
+    from jaxcal.results.rerun_file import require_rerun, write_rerun
 
+    if rerun is not None:
+        require_rerun(rerun)
     calibration = load_calibration(result)
     names = [camera.name for camera in calibration.cameras]
     images = {}
@@ -45,5 +52,7 @@ def report(result: Path, sources: tuple[str, ...], out: Path | None) -> None:
     with ProgressBars() as bars:
         found = load_cross_validation(folder)
         verdict = write_report(calibration, path, images=images, progress=bars, cross_validation=found)
+    if rerun is not None:
+        write_rerun(calibration, rerun)
     click.echo(verdict.headline)
     click.echo(f"report: {path.resolve()}")

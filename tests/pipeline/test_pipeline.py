@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 import yaml
 
-from jaxcal import CalibrationError, Checkerboard, Detections, run_pipeline
+from jaxcal import Calibration, CalibrationError, Checkerboard, Detections, compare, run_pipeline
 from jaxcal import pipeline as pipeline_module
 from jaxcal.cameras import PinholeRadtan
 from jaxcal.observations import Events, Frames
 from jaxcal.pipeline import PipelineSettings
 from jaxcal.recording import EventFile, convert_events
+from jaxcal.results import load_cross_validation
+from jaxcal.results.cross_validation import CrossValidation, Evidence, Halves
 
 BOARD = Checkerboard(rows=5, cols=8, spacing=0.05)
 TARGET = BOARD.to_yaml()
@@ -80,6 +82,24 @@ def test_detection_files_become_a_calibration(tmp_path: Path) -> None:
     assert calibration.cameras[1].T_cn_cnm1[:3, 3] == pytest.approx(BASELINE, abs=2e-3)
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {"calibration.npz", "camchain.yaml", "results.txt"}
     assert stages
+
+
+def test_a_cross_validation_asked_for_is_kept_and_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[CrossValidation] = []
+
+    def validate(calibration: Calibration, **_: Any) -> CrossValidation:
+        halves = Halves("in turns", compare(calibration, calibration), 9.0, 8, 0.34)
+        found.append(CrossValidation((halves,), (Evidence("lens", "cam0", 1.0, 2, 0.6, -1.0),)))
+        return found[0]
+
+    monkeypatch.setattr(pipeline_module, "cross_validate", validate)
+    simulated_detections(0)[0].save(tmp_path / "cam0.npz")
+    rig = write_rig(tmp_path, [{"name": "cam0", "model": "pinhole-radtan", "detections": "cam0.npz"}])
+    run_pipeline(rig, tmp_path / "out", settings=PipelineSettings(cross_validate=True))
+    kept = load_cross_validation(tmp_path / "out")
+    assert kept is not None
+    assert kept.text() == found[0].text()
+    assert found[0].headline in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_mistakes_in_the_rig_are_reported_before_any_work(tmp_path: Path) -> None:
