@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxcal.calibration.assemble import CameraFrames, split_groups
-from jaxcal.calibration.lens_basis import to_parameters
 from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.robust import RobustFit, corner_errors
 from jaxcal.calibration.state import RigState, SharedLayout
@@ -32,6 +31,9 @@ _SAME_COST = 1e-8
 # following: two optima of nearly equal cost lie at the ends of a curved valley that no straight step stays in.
 _WALK_SIGMAS = (10.0, 30.0)
 _MOST_WALKS = 4
+# A walk need not be exact; it ends where the cost rises by more than this share of what a quadratic would.
+_ENOUGH_TO_WALK = 1e-5
+_STEEP = 0.5
 # An optimum so many sigmas away is another one; it is as good within three sigmas when it costs no more than this
 # (half of 3 squared) beside.
 _RIVAL_SIGMAS = 3.0
@@ -103,24 +105,26 @@ def _along_the_valley(fit: RobustFit, max_steps: int) -> tuple[SolveResult | Non
         return None, False
     covariance = np.zeros((len(free), len(free)))
     covariance[np.ix_(free, free)] = (directions / values) @ directions.T
-    back = to_parameters(problem.basis, layout)
-    if back is not None:
-        covariance = back @ covariance @ back.T
     best, own_cost, rivalled = None, float(fit.result.equations.cost), False
     lowest = own_cost
     for camera in range(layout.num_cameras):
         own = layout.lens(camera)
         functional = _weakest(covariance[own, own])
-        if functional is None:
+        # Lenses whose parameters nearly cancel have valleys without an end, and a prior that says where to stay.
+        if functional is None or problem.basis[layout.place(camera)[0]] is not None:
             continue
         for side in (1.0, -1.0):
             state = fit.state
             for sigmas in _WALK_SIGMAS:
                 held = _held_at(problem, fit.state, camera, functional, side * sigmas)
-                state = solve(held, state, max_steps=max_steps).state
+                there = solve(held, state, max_steps=max_steps, rtol=_ENOUGH_TO_WALK)
+                state = there.state
+                flat = float(there.equations.cost) - own_cost <= _STEEP * 0.5 * sigmas**2
+                if not flat:  # or not a number
+                    break
                 released = solve(problem, state, max_steps=max_steps)
                 cost = float(released.equations.cost)
-                if not np.isfinite(cost):
+                if not (bool(released.converged) and np.isfinite(cost)):
                     continue
                 away = functional @ (_lens(layout, released.state, camera) - _lens(layout, fit.state, camera))
                 rivalled = rivalled or bool(abs(away) > _RIVAL_SIGMAS and abs(cost - own_cost) < _AS_GOOD)
