@@ -65,6 +65,7 @@ class Material:
 
 
 def read(folder: Path) -> Material:
+    """The recording in the folder of all recordings."""
     path = folder / "euroc_imu_april" / "observations.npz"
     detections = [load_detections(path, TARGET, (752, 480), name) for name in ("cam0", "cam1")]
     with np.load(path) as table:
@@ -73,6 +74,7 @@ def read(folder: Path) -> Material:
 
 
 def calibrate(material: Material, model: str, **options: object) -> Calibration:
+    """Both cameras with one model, the IMU's noise re-estimated; `options` of `calibrate_camera_imu`."""
     return calibrate_camera_imu(
         material.detections,
         material.imu,
@@ -93,10 +95,12 @@ def difference(calibration: Calibration, T_imu_cam0: np.ndarray) -> tuple[float,
 
 
 def in_combined_sigmas(one: Calibration, other: Calibration, block: str, error: np.ndarray) -> float:
+    """The largest entry of a difference of both in their combined sigmas."""
     return float(np.max(np.abs(error) / np.hypot(one.std(block), other.std(block))))
 
 
 def row_of(name: str, calibration: Calibration) -> str:
+    """One calibration beside the published figures."""
     degrees, mm = difference(calibration, PUBLISHED_T_IMU_CAM0)
     first = calibration.cameras[0]
     numbers = ", ".join(f"{v:.2f}" for v in np.asarray(first.model.intrinsics))

@@ -114,10 +114,7 @@ def robust_fit(
         state = result.state
         errors = split_groups(layout, cameras, [np.asarray(e) for e in corner_errors(problem, state)])
         # In units of an ordinary corner: what a detector knows to be vague may err more.
-        scaled = [
-            e * frames.precision[..., None] / n[:, None, None]
-            for e, frames, n in zip(errors, cameras, noise, strict=True)
-        ]
+        scaled = _in_usual_units(errors, cameras, noise)
         if not np.isfinite(float(result.equations.cost)):
             raise CalibrationError(
                 "the optimisation diverged: the residuals are not finite. Check for frames with a wrong board, and "
@@ -147,7 +144,7 @@ def robust_fit(
         )
     progress("optimise", ROUNDS, ROUNDS)
     assert result is not None
-    usual = [e * frames.precision[..., None] for e, frames in zip(errors, cameras, strict=True)]
+    usual = _in_usual_units(errors, cameras, all_alike([len(s) for s in seen]))
     sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(usual, kept, parameters, strict=True)]
     return RobustFit(problem, result, errors, kept, sigmas, redundancy)
 
@@ -160,6 +157,15 @@ def estimated_parameters(problem: RigProblem, pose_parameters: Sequence[float]) 
     return [
         float(free[layout.lens(c)].sum() + free[layout.pose(c)].sum()) + of_target + of_poses
         for c, of_poses in enumerate(pose_parameters)
+    ]
+
+
+def _in_usual_units(
+    errors: Sequence[np.ndarray], cameras: Sequence[CameraFrames], noise: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Errors (F, N, 2) as if each were of an ordinary corner in an ordinary view."""
+    return [
+        e * frames.precision[..., None] / n[:, None, None] for e, frames, n in zip(errors, cameras, noise, strict=True)
     ]
 
 

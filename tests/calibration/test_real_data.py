@@ -42,6 +42,17 @@ EUROC_T_IMU_CAM0 = np.array(
 )
 
 
+def _euroc(data_folder: Path) -> tuple[list[Detections], ImuRecording, AprilGrid]:
+    """Corners of both cameras, the IMU with its stated noise, the board."""
+    path = data_folder / "euroc_imu_april" / "observations.npz"
+    target = AprilGrid(rows=6, cols=6, tag_size=0.088, tag_spacing=0.3)
+    detections = [load_detections(path, target, (752, 480), name) for name in ("cam0", "cam1")]
+    with np.load(path) as table:
+        noise = ImuNoise(1.6968e-4, 1.9393e-5, 2.0e-3, 3.0e-3)
+        imu = ImuRecording(table["imu_ns"], table["gyro_rad_s"], table["acc_m_s2"], noise)
+    return detections, imu, target
+
+
 def test_opencv_left_camera(data_folder: Path) -> None:
     """OpenCV publishes an RMS of 0.393 px for these thirteen images; on our corners it finds the lens that we find."""
     paths = sorted((data_folder / "opencv_stereo").glob("left*.jpg"))
@@ -119,9 +130,7 @@ def _trimmed(error: np.ndarray) -> float:
 
 
 def test_euroc_cameras_without_the_imu(data_folder: Path) -> None:
-    path = data_folder / "euroc_imu_april" / "observations.npz"
-    target = AprilGrid(rows=6, cols=6, tag_size=0.088, tag_spacing=0.3)
-    detections = [load_detections(path, target, (752, 480), name) for name in ("cam0", "cam1")]
+    detections, _, target = _euroc(data_folder)
     calibration = calibrate_cameras(detections, target)
     for camera, focal in zip(calibration.cameras, EUROC_FOCALS, strict=True):
         log.info("%s: %s, rms %.3f px", camera.name, np.asarray(camera.model.intrinsics), camera.reprojection_rms_px)
@@ -160,12 +169,7 @@ def test_kalibrs_own_corners_give_at_most_kalibrs_errors(data_folder: Path) -> N
 
 def test_euroc_stereo_and_imu(data_folder: Path) -> None:
     """Both cameras and the IMU at once, beside the figures published for the rig."""
-    path = data_folder / "euroc_imu_april" / "observations.npz"
-    target = AprilGrid(rows=6, cols=6, tag_size=0.088, tag_spacing=0.3)
-    detections = [load_detections(path, target, (752, 480), name) for name in ("cam0", "cam1")]
-    with np.load(path) as table:
-        noise = ImuNoise(1.6968e-4, 1.9393e-5, 2.0e-3, 3.0e-3)
-        imu = ImuRecording(table["imu_ns"], table["gyro_rad_s"], table["acc_m_s2"], noise)
+    detections, imu, target = _euroc(data_folder)
     calibration = calibrate_camera_imu(detections, imu, target)
     first, second = calibration.cameras
     assert first.T_cam_imu is not None
@@ -194,12 +198,7 @@ def test_euroc_stereo_and_imu(data_folder: Path) -> None:
 
 def test_the_halves_of_the_euroc_recording_agree(data_folder: Path) -> None:
     """Calibrated apart, with a lens that is not too lean, a board that may be bent, and IMU noise re-estimated."""
-    path = data_folder / "euroc_imu_april" / "observations.npz"
-    target = AprilGrid(rows=6, cols=6, tag_size=0.088, tag_spacing=0.3)
-    detections = [load_detections(path, target, (752, 480), name) for name in ("cam0", "cam1")]
-    with np.load(path) as table:
-        noise = ImuNoise(1.6968e-4, 1.9393e-5, 2.0e-3, 3.0e-3)
-        imu = ImuRecording(table["imu_ns"], table["gyro_rad_s"], table["acc_m_s2"], noise)
+    detections, imu, target = _euroc(data_folder)
     middle = (int(imu.timestamps_ns[0]) + int(imu.timestamps_ns[-1])) // 2
     one, other = (
         calibrate_camera_imu(
