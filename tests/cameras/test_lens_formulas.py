@@ -130,8 +130,9 @@ def test_eucm_and_double_sphere_equal_their_papers(alpha: float, beta: float, xi
     d1 = np.sqrt(x**2 + y**2 + z**2)
     d2 = np.sqrt(x**2 + y**2 + (xi * d1 + z) ** 2)
     below = alpha * d2 + (1 - alpha) * (xi * d1 + z)
-    expected = np.array(CORE[2:]) + np.array(CORE[:2]) * points[:, :2] / below[:, None]
-    np.testing.assert_allclose(projected("ds-none", np.r_[xi, alpha, CORE], points), expected, rtol=1e-9)
+    seen = below > 0.02 * d1  # a negative xi narrows the lens' view: beyond its border the formula means nothing
+    expected = np.array(CORE[2:]) + np.array(CORE[:2]) * points[seen, :2] / below[seen, None]
+    np.testing.assert_allclose(projected("ds-none", np.r_[xi, alpha, CORE], points[seen]), expected, rtol=1e-9)
 
 
 def test_omni_radtan_is_radtan_on_the_plane_of_omni() -> None:
