@@ -9,6 +9,7 @@ import numpy as np
 from jaxcal.calibration.state import SharedLayout
 from jaxcal.calibration.vision import FRAME_BATCH, VisionData
 from jaxcal.errors import CalibrationError
+from jaxcal.estimation import on_device
 from jaxcal.observations import Detections
 from jaxcal.targets import Target
 
@@ -127,7 +128,7 @@ def stack_groups(layout: SharedLayout, per_camera: Sequence[np.ndarray]) -> tupl
     stacked = []
     for members in layout.groups:
         joined = np.concatenate([_fill_batches(np.asarray(per_camera[c])) for c in members])
-        stacked.append(jnp.asarray(_pad_to(joined, round_up(len(joined), FRAME_BATCH))))
+        stacked.append(on_device(_pad_to(joined, round_up(len(joined), FRAME_BATCH))))
     return tuple(stacked)
 
 
@@ -172,7 +173,7 @@ def stack_weights(
             masked = np.where(cameras[c].seen, weights[c], 0.0)
             rows.append(np.pad(masked, [(0, -len(masked) % FRAME_BATCH), (0, 0)]))
         joined = np.concatenate(rows)
-        stacked.append(jnp.asarray(np.pad(joined, [(0, round_up(len(joined), FRAME_BATCH) - len(joined)), (0, 0)])))
+        stacked.append(on_device(np.pad(joined, [(0, round_up(len(joined), FRAME_BATCH) - len(joined)), (0, 0)])))
     return tuple(stacked)
 
 

@@ -24,7 +24,7 @@ from jaxcal.calibration.state import RigState, SharedLayout, flat_target, layout
 from jaxcal.calibration.target_shape import TargetGeometry, geometry_of
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
-from jaxcal.estimation import LOSSES, Loss
+from jaxcal.estimation import LOSSES, Loss, on_device
 from jaxcal.imu import imu_model
 from jaxcal.observations import Detections, ImuRecording
 from jaxcal.progress import Progress, no_progress, track
@@ -280,11 +280,11 @@ def _problem(
         templates=solving.templates_of(lenses, layout),
         corners=vision_data(layout, frames, weights=[np.ones(f.seen.shape) for f in frames], times=start.times),
         geometry=geometry,
-        imu=InertialData(tuple(b.samples for b in binned), jnp.asarray(grid.start), jnp.asarray(grid.dt)),
+        imu=InertialData(tuple(b.samples for b in binned), on_device(grid.start), on_device(grid.dt)),
         prior=prior,
-        free_chain=jnp.ones((grid.intervals + grid.order - 1, 6 + 6 * len(binned)), dtype=bool),
-        free=jnp.asarray(free),
-        loss_width=jnp.asarray(1.0),
+        free_chain=on_device(np.ones((grid.intervals + grid.order - 1, 6 + 6 * len(binned)), dtype=bool)),
+        free=on_device(free),
+        loss_width=on_device(1.0),
         basis=own_parameters(lenses, layout),
         layout=layout,
         order=grid.order,
@@ -303,7 +303,7 @@ def _lens_prior(cameras: Calibration, layout: SharedLayout) -> LensPrior:
 
     return LensPrior(
         mean=tuple(jnp.stack([cameras.cameras[c].model.parameters for c in members]) for members in layout.groups),
-        information=tuple(jnp.stack([jnp.asarray(information(c)) for c in members]) for members in layout.groups),
+        information=tuple(jnp.stack([on_device(information(c)) for c in members]) for members in layout.groups),
     )
 
 
@@ -325,19 +325,19 @@ def _first_state(
     biases = np.concatenate([[*b, 0.0, 0.0, 0.0] for b in (bias, *(place.gyro_bias for place in others[1:]))])
     return RigState(
         lenses=solving.stack_lenses(lenses, layout),
-        R_cam_rig=jnp.asarray(np.stack([a.R_cam_imu for a in start.alignments])),
-        t_cam_rig=jnp.asarray(np.stack(start.t_cam_imu)),
-        shift=jnp.asarray([a.shift_s for a in start.alignments]),
-        gravity=jnp.asarray(initial_imu.gravity_from(orientation, imu.accel_m_s2[inside])),
-        rotations=jnp.asarray(rotations),
-        positions=jnp.asarray(positions),
-        biases=jnp.tile(jnp.asarray(biases), (len(positions), 1)),
+        R_cam_rig=on_device(np.stack([a.R_cam_imu for a in start.alignments])),
+        t_cam_rig=on_device(np.stack(start.t_cam_imu)),
+        shift=on_device([a.shift_s for a in start.alignments]),
+        gravity=on_device(initial_imu.gravity_from(orientation, imu.accel_m_s2[inside])),
+        rotations=on_device(rotations),
+        positions=on_device(positions),
+        biases=on_device(np.tile(biases, (len(positions), 1))),
         target=flat_target(layout),
-        imu_parameters=tuple(jnp.asarray(imu_model(imu.model).nominal, dtype=float) for imu in layout.imus),
-        R_imu_rig=jnp.asarray(np.stack([place.R_imu_imu0 for place in others])),
-        t_imu_rig=jnp.zeros((len(others), 3)),
-        imu_shift=jnp.asarray([place.shift_s for place in others]),
-        line_delay=jnp.zeros(len(lenses) if layout.rolling else 0),
+        imu_parameters=tuple(on_device(np.asarray(imu_model(imu.model).nominal, dtype=float)) for imu in layout.imus),
+        R_imu_rig=on_device(np.stack([place.R_imu_imu0 for place in others])),
+        t_imu_rig=on_device(np.zeros((len(others), 3))),
+        imu_shift=on_device([place.shift_s for place in others]),
+        line_delay=on_device(np.zeros(len(lenses) if layout.rolling else 0)),
     )
 
 

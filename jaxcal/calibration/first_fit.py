@@ -21,7 +21,7 @@ _FREE_DAMPING = 1e-9
 _LARGEST_DAMPING = 1e10
 # Poses by themselves: settled when the cost falls by less than this share, or after some failures on end (the damping's
 # factor doubles with each); compared with a rival after some steps, and given up where they are far above it.
-_POSE_RTOL = 1e-7
+_POSE_RTOL = 1e-5
 _FAILED = 10.0
 _FAIR_STEPS = 3
 _HOPELESS = 9.0

@@ -1,6 +1,7 @@
 """Time offset, rotation to the IMU and gyro bias from turning alone; gravity and a first trajectory."""
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,28 +73,19 @@ class TurnIntegral:
         rate[outside] = np.nan
         return rate
 
-    def mean_rates(
-        self, start: np.ndarray, stop: np.ndarray, step_s: float, most: int
-    ) -> Iterator[tuple[float, np.ndarray]]:
-        """`mean_rate` (3, n) over the spans moved by each of -most .. most steps, in this order.
+    def turning_on_grid(self, fine_s: float, spans: np.ndarray) -> np.ndarray:
+        """Magnitude (S, G) of the mean angular velocity over spans of these lengths (S,), counted in steps of a grid of
+        time that begins with the recording; NaN where a span leaves it."""
+        values = self._at(np.arange(self._time[0], self._time[-1], fine_s))
+        out = np.full((len(spans), len(values)), np.nan, dtype=np.float32)
+        for row, span in zip(out, spans, strict=True):
+            turn = values[span:] - values[: len(values) - span]
+            row[: len(turn)] = np.sqrt(np.einsum("na,na->n", turn, turn)) / (span * fine_s)
+        return out
 
-        The integral is sampled once on a grid finer than the step, so that moving a span is moving an index.
-        """
-        fine = step_s / _GRID_PER_STEP
-        grid = np.arange(self._time[0], self._time[-1], fine)
-        values = np.ascontiguousarray(self._at(grid).T)
-        # Where a span ends between samples of the grid stays as it is while it moves.
-        place = [(t - grid[0]) / fine for t in (start, stop)]
-        index = [np.floor(p).astype(np.int64) for p in place]
-        fraction = [p - i for p, i in zip(place, index, strict=True)]
-        for k in range(-most, most + 1):
-            first, last = (i + k * _GRID_PER_STEP for i in index)
-            inside = (first >= 0) & (last < len(grid) - 1)
-            ends = []
-            for i, f in ((first, fraction[0]), (last, fraction[1])):
-                i = np.where(inside, i, 0)
-                ends.append(values[:, i] * (1.0 - f) + values[:, i + 1] * f)
-            yield k * step_s, np.where(inside, (ends[1] - ends[0]) / (stop - start), np.nan)
+    @property
+    def start_s(self) -> float:
+        return float(self._time[0])
 
 
 def align(track: CameraTrack, imu_time_s: np.ndarray, gyro: np.ndarray, name: str) -> Alignment:
@@ -212,11 +204,23 @@ def _camera_rates(track: CameraTrack, name: str) -> tuple[np.ndarray, np.ndarray
 
 
 def _coarse_shift(start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral) -> tuple[float, float]:
-    """Offset with the largest correlation of rate magnitudes over at least half of the spans."""
+    """Offset with the largest correlation of rate magnitudes over at least half of the spans.
+
+    The gyroscope's turning is laid out once on a grid finer than the offsets tried, for each length of span that there
+    is, so that to try an offset is to look up.
+    """
     magnitude = np.minimum(np.linalg.norm(rate, axis=1), 20.0)
+    fine = _COARSE_STEP_S / _GRID_PER_STEP
+    spans, which = np.unique(np.maximum(np.round((stop - start) / fine).astype(np.int64), 1), return_inverse=True)
+    turning = integral.turning_on_grid(fine, spans)
+    size = turning.shape[1]
+    place = np.round((start - integral.start_s) / fine).astype(np.int64)
     best = (0.0, -1.0)
-    for shift, measured in integral.mean_rates(start, stop, _COARSE_STEP_S, round(_LARGEST_SHIFT_S / _COARSE_STEP_S)):
-        other = np.sqrt(np.sum(measured**2, axis=0))
+    most = round(_LARGEST_SHIFT_S / _COARSE_STEP_S)
+    for k in range(-most, most + 1):
+        at = place + k * _GRID_PER_STEP
+        within = (at >= 0) & (at < size)
+        other = np.where(within, turning[which, np.where(within, at, 0)], np.nan)
         inside = np.isfinite(other)
         count = np.count_nonzero(inside)
         if count < 0.5 * len(magnitude):
@@ -227,7 +231,7 @@ def _coarse_shift(start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integra
         correlation = float(a @ b / spread) if spread > 0 else 0.0
         # Among equals the smaller offset is the likelier.
         if correlation > best[1] + 1e-9:
-            best = (shift, correlation)
+            best = (k * _COARSE_STEP_S, correlation)
     return best
 
 
@@ -266,14 +270,23 @@ def orientation_track(time_s: np.ndarray, rotation: np.ndarray, imu_time_s: np.n
 
 
 def _running_product(steps: Rotation) -> Rotation:
-    """Identity, s0, s0 s1, s0 s1 s2, ...: a prefix product in log2(N) vectorised passes."""
-    quaternions = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], steps.as_quat()])
-    reach = 1
-    while reach < len(quaternions):
-        product = Rotation.from_quat(quaternions[:-reach]) * Rotation.from_quat(quaternions[reach:])
-        quaternions = np.concatenate([quaternions[:reach], product.as_quat()])
-        reach *= 2
-    return Rotation.from_quat(quaternions)
+    """Identity, s0, s0 s1, s0 s1 s2, ...: within blocks side by side, then the blocks one after another."""
+    count = len(steps) + 1
+    length = math.isqrt(count - 1) + 1
+    blocks = -(-count // length)
+    identity = [0.0, 0.0, 0.0, 1.0]
+    quaternions = np.tile(identity, (blocks * length, 1))
+    quaternions[1:count] = steps.as_quat()
+    factors = quaternions.reshape(blocks, length, 4)
+    within = [Rotation.from_quat(factors[:, 0])]
+    for place in range(1, length):
+        within.append(within[-1] * Rotation.from_quat(factors[:, place]))
+    before = [Rotation.from_quat(identity)]
+    for block in range(blocks - 1):
+        before.append(before[-1] * within[-1][block])
+    inside = np.stack([r.as_quat() for r in within], axis=1).reshape(-1, 4)[:count]
+    carried = np.repeat([r.as_quat() for r in before], length, axis=0)[:count]
+    return Rotation.from_quat(carried) * Rotation.from_quat(inside)
 
 
 def gravity_from(rotation: np.ndarray, accel: np.ndarray) -> np.ndarray:

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.calibration import solving
@@ -22,7 +21,7 @@ from jaxcal.calibration.view_noise import weigh_views
 from jaxcal.calibration.views import associate
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
-from jaxcal.estimation import SolveResult, solve
+from jaxcal.estimation import SolveResult, on_device, solve
 from jaxcal.results import Calibration
 
 
@@ -155,7 +154,7 @@ def known_problem(
         free = np.array(problem.free)
         for c in range(len(names)):
             free[layout.pose(c)] = False
-        problem = eqx.tree_at(lambda p: p.free, problem, jnp.asarray(free))
+        problem = eqx.tree_at(lambda p: p.free, problem, on_device(free))
     since = (times - times.min()) * 1e-9
     return KnownProblem(calibration, cameras, views, since, kept, weights, noises, inflation, tied, problem, state)
 

@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from jaxcal.calibration.generic_lens import Projection
 from jaxcal.cameras import CameraModel
+from jaxcal.estimation import on_device
 
 # Points per call: large enough to vectorise, small enough that padding costs nothing.
 _CHUNK = 4096
@@ -38,7 +39,7 @@ class ModelLens:
         outputs = []
         for chunk in _chunks(flat, fill=1.0):
             program = _with_lens if with_lens else _without_lens
-            outputs.append(program(self._template, jnp.asarray(parameters), jnp.asarray(chunk)))
+            outputs.append(program(self._template, on_device(parameters), on_device(chunk)))
 
         def joined(part: int) -> np.ndarray:
             values = np.concatenate([np.asarray(output[part]) for output in outputs], axis=-1)[..., : len(flat)]

@@ -8,13 +8,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from scipy.linalg import solveh_banded
 
 from jaxcal.calibration.assemble import CameraFrames, split_groups
 from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.robust import RobustFit, corner_errors
 from jaxcal.calibration.state import RigState, SharedLayout
 from jaxcal.calibration.uncertainty import shared_information
-from jaxcal.estimation import BlockArrow, SolveResult, damped_step, single_threaded_blas, solve
+from jaxcal.estimation import BlockArrow, SolveResult, on_device, solve
 
 logger = logging.getLogger(__name__)
 
@@ -61,10 +62,10 @@ def confirm_optimum(fit: RobustFit, cameras: Sequence[CameraFrames], *, max_step
     agreed, bent, worse = 0, False, None
     for attempt in range(_MOST_RESTARTS):
         sigmas = _RESTART_SIGMAS if attempt == 0 else _MORE_SIGMAS[attempt % len(_MORE_SIGMAS)]
-        force = _displacement(fit, sigmas, rng)
-        if force is None:
+        step = _displacement(fit, sigmas, rng)
+        if step is None:
             return fit, []
-        start, halved = _left(fit, force)
+        start, halved = _left(fit, step, sigmas)
         result = solve(fit.problem, start, max_steps=max_steps)
         before, after = float(fit.result.equations.cost), float(result.equations.cost)
         logger.info("restart %d: cost %.9g, from %.9g", attempt, after, before)
@@ -163,8 +164,8 @@ def _held_at(problem: RigProblem, state: RigState, camera: int, functional: np.n
     wanted = information @ mean + _HOLD * functional * (functional @ now + value)
     middle = np.linalg.lstsq(information + hold, wanted, rcond=None)[0]
     means, informations = list(problem.prior.mean), list(problem.prior.information)
-    means[group] = means[group].at[place].set(jnp.asarray(middle))
-    informations[group] = informations[group].at[place].set(jnp.asarray(information + hold))
+    means[group] = means[group].at[place].set(on_device(middle))
+    informations[group] = informations[group].at[place].set(on_device(information + hold))
     return eqx.tree_at(lambda p: p.prior, problem, LensPrior(tuple(means), tuple(informations)))
 
 
@@ -178,41 +179,51 @@ def _uncertain(cost: float, worse: float | None) -> str:
     )
 
 
-def _left(fit: RobustFit, force: np.ndarray) -> tuple[RigState, bool]:
-    """The state that is away from the optimum by what `force` does to it, or nearer where that is no place to start;
-    and whether it had to be nearer."""
-    before = float(fit.result.equations.cost)
+def _left(fit: RobustFit, step: np.ndarray, sigmas: float) -> tuple[RigState, bool]:
+    """The state that is away from the optimum by a step (P,) of the shared parameters, so many sigmas along each of
+    their directions, or nearer where that is no place to start; and whether it had to be nearer."""
+    equations, before = fit.result.equations, float(fit.result.equations.cost)
+    chain = _following(equations, step)
+    promised = 0.5 * sigmas**2 * int(np.sum(np.asarray(fit.problem.free)))
     for halving in range(_HALVINGS):
         share = 0.5**halving
-        with single_threaded_blas():
-            start, cost, promised = _moved(fit.problem, fit.result.equations, fit.state, jnp.asarray(share * force))
-        if float(cost) - before <= _BELIEVABLE * float(promised):
+        start, cost = _moved(fit.problem, fit.state, on_device(share * chain), on_device(share * step))
+        if float(cost) - before <= _BELIEVABLE * share**2 * promised:
             break
     logger.info("restart from %g of the way, cost %.9g", share, float(cost))
     return start, halving > 0
 
 
 @eqx.filter_jit
-def _moved(problem: RigProblem, equations: BlockArrow, state: RigState, force: Array) -> tuple[RigState, Array, Array]:
-    """Push the shared parameters; the chain follows, as far as a quadratic cost tells. The cost there, and the increase
-    that the quadratic promised."""
-    pushed = eqx.tree_at(
-        lambda e: (e.gradient_chain, e.gradient_shared), equations, (0.0 * equations.gradient_chain, -force)
-    )
-    step = damped_step(pushed, jnp.asarray(0.0))
-    moved = problem.retract(state, step.chain, step.shared)
-    return moved, 0.5 * jnp.sum(problem.residuals(moved) ** 2), step.predicted
+def _moved(problem: RigProblem, state: RigState, chain: Array, shared: Array) -> tuple[RigState, Array]:
+    """The state after a step, and its cost without the robust loss."""
+    moved = problem.retract(state, chain, shared)
+    return moved, 0.5 * jnp.sum(problem.residuals(moved) ** 2)
+
+
+def _following(equations: BlockArrow, shared: np.ndarray) -> np.ndarray:
+    """The step (K, B) of the chain that makes the best of a step (P,) of the shared parameters, were the cost
+    quadratic."""
+    band = np.asarray(equations.band)
+    blocks, width, size, _ = band.shape
+    # LAPACK's lower band storage: row i + d of column i stands in row d.
+    lower = np.zeros((width * size, blocks * size))
+    for column in range(size):
+        below = band[:, :, :, column].reshape(blocks, width * size)[:, column:]
+        lower[: width * size - column, column::size] = below.T
+    # As the covariance does: what nothing observes (knots in a gap) must not spoil the factor.
+    lower[0] += 1e-13 * np.maximum(lower[0], 1e-6 * lower[0].max())
+    force = -np.asarray(equations.border).reshape(blocks * size, -1) @ shared
+    return solveh_banded(lower, force, lower=True).reshape(blocks, size)
 
 
 def _displacement(fit: RobustFit, sigmas: float, rng: np.random.Generator) -> np.ndarray | None:
-    """The force on the shared parameters (P,) that moves them by so many sigmas along each direction; None where
+    """A step of the shared parameters (P,), so many sigmas along each of their directions, to either side; None where
     directions are not determined."""
     free = np.asarray(fit.problem.free)
     values, directions = shared_information(fit.result.equations, free)
     if not len(values) or values.min() <= 0:
         return None
-    # A sigma along direction d is d / sqrt(value); the information turns that into d' sqrt(value), d' the dual of d.
-    dual = np.linalg.inv(directions).T
-    force = np.zeros(len(free))
-    force[free] = dual @ (sigmas * rng.choice([-1.0, 1.0], size=len(values)) * np.sqrt(values))
-    return force
+    step = np.zeros(len(free))
+    step[free] = directions @ (sigmas * rng.choice([-1.0, 1.0], size=len(values)) / np.sqrt(values))
+    return step

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.calibration import outliers
@@ -16,7 +15,7 @@ from jaxcal.calibration.redundancy import Redundancy, measure_redundancy
 from jaxcal.calibration.state import RigState
 from jaxcal.calibration.view_noise import all_alike, weigh_views
 from jaxcal.errors import CalibrationError
-from jaxcal.estimation import FIRST_DAMPING, SolveResult, solve
+from jaxcal.estimation import FIRST_DAMPING, SolveResult, on_device, solve
 from jaxcal.progress import Progress
 
 logger = logging.getLogger(__name__)
@@ -185,5 +184,5 @@ def _with_weights(
     return eqx.tree_at(
         lambda p: [*[data.weight for data in p.corners], p.loss_width],
         problem,
-        [*stack_weights(problem.layout, cameras, weights), jnp.asarray(float(loss_width))],
+        [*stack_weights(problem.layout, cameras, weights), on_device(float(loss_width))],
     )

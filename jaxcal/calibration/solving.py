@@ -19,7 +19,7 @@ from jaxcal.calibration.state import (
 )
 from jaxcal.calibration.target_shape import geometry_of
 from jaxcal.cameras import CameraModel
-from jaxcal.estimation import SolveResult, solve
+from jaxcal.estimation import SolveResult, on_device, solve
 from jaxcal.targets import Target
 
 _VIEW_STEP = 16
@@ -46,8 +46,8 @@ def lens_prior(models: Sequence[CameraModel], layout: SharedLayout, cameras: Seq
                 information[place] += model.usual_spread[name] ** -2
         informations[c] = np.diag(information)
     return LensPrior(
-        mean=tuple(jnp.asarray(np.stack([means[c] for c in members])) for members in layout.groups),
-        information=tuple(jnp.asarray(np.stack([informations[c] for c in members])) for members in layout.groups),
+        mean=tuple(on_device(np.stack([means[c] for c in members])) for members in layout.groups),
+        information=tuple(on_device(np.stack([informations[c] for c in members])) for members in layout.groups),
     )
 
 
@@ -66,7 +66,7 @@ def templates_of(models: Sequence[CameraModel], layout: SharedLayout) -> tuple[C
 
 def stack_lenses(models: Sequence[CameraModel], layout: SharedLayout) -> tuple[jnp.ndarray, ...]:
     """Lens parameters (C_g, n) of each group."""
-    return tuple(jnp.stack([models[c].parameters for c in members]) for members in layout.groups)
+    return tuple(on_device(np.stack([np.asarray(models[c].parameters) for c in members])) for members in layout.groups)
 
 
 def camera_problem(
@@ -96,7 +96,7 @@ def camera_problem(
 
     target_state = flat_target(layout)
     if boards is not None and len(boards[0]):
-        placed = (jnp.asarray(boards[0]), jnp.asarray(boards[1]))
+        placed = (on_device(boards[0]), on_device(boards[1]))
         target_state = eqx.tree_at(lambda t: (t.R_target_board, t.t_target_board), target_state, placed)
     count = len(T_target_rig[0])
     padding = round_up(count, _VIEW_STEP) - count
@@ -111,9 +111,9 @@ def camera_problem(
         geometry=geometry_of(target, offset_sigma_m),
         imu=None,
         prior=lens_prior(models, layout, cameras),
-        free_chain=jnp.asarray(free_chain),
-        free=jnp.asarray(free),
-        loss_width=jnp.asarray(float(loss_width)),
+        free_chain=on_device(free_chain),
+        free=on_device(free),
+        loss_width=on_device(float(loss_width)),
         basis=own_parameters(models, layout),
         layout=layout,
         order=1,
@@ -121,13 +121,13 @@ def camera_problem(
     )
     state = RigState(
         lenses=stack_lenses(models, layout),
-        R_cam_rig=jnp.asarray(T_cam_rig[0]),
-        t_cam_rig=jnp.asarray(T_cam_rig[1]),
-        shift=jnp.zeros(layout.num_cameras),
+        R_cam_rig=on_device(T_cam_rig[0]),
+        t_cam_rig=on_device(T_cam_rig[1]),
+        shift=on_device(np.zeros(layout.num_cameras)),
         gravity=jnp.array([0.0, 0.0, -1.0]),
-        rotations=jnp.asarray(rotations),
-        positions=jnp.asarray(positions),
-        biases=jnp.zeros((len(positions), 0)),
+        rotations=on_device(rotations),
+        positions=on_device(positions),
+        biases=on_device(np.zeros((len(positions), 0))),
         target=target_state,
     )
     return problem, state

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from scipy.interpolate import CubicSpline, PchipInterpolator, make_lsq_spline
@@ -10,6 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from jaxcal.calibration.assemble import round_up
 from jaxcal.calibration.inertial import INTERVAL_BATCH, ImuSamples
+from jaxcal.estimation import on_device
 from jaxcal.observations import ImuNoise
 
 _RATES_HZ = (10.0, 15.0, 20.0, 30.0, 45.0, 70.0, 100.0)
@@ -121,7 +121,7 @@ class BinnedImu:
         readings = np.asarray(old.readings)[self.slots[:, 0], self.slots[:, 1]]
         fraction, placed, present, slots = _place(grid, self.time_s + shift_s, readings, old.present.shape[1])
         samples = ImuSamples(
-            fraction, placed, present, old.inverse_sigma, old.walk_sigma, shift=jnp.asarray(float(shift_s))
+            fraction, placed, present, old.inverse_sigma, old.walk_sigma, shift=on_device(float(shift_s))
         )
         return BinnedImu(samples, slots, self.index, self.time_s)
 
@@ -147,11 +147,11 @@ def bin_imu(
         fraction=fraction,
         readings=placed,
         present=present,
-        inverse_sigma=jnp.asarray(
+        inverse_sigma=on_device(
             np.repeat([1.0 / (noise.gyro_noise_density * sample), 1.0 / (noise.accel_noise_density * sample)], 3)
         ),
-        walk_sigma=jnp.asarray(np.repeat([noise.gyro_random_walk * step, noise.accel_random_walk * step], 3)),
-        shift=jnp.asarray(float(shift_s)),
+        walk_sigma=on_device(np.repeat([noise.gyro_random_walk * step, noise.accel_random_walk * step], 3)),
+        shift=on_device(float(shift_s)),
     )
     return BinnedImu(samples, slots, inside, time_s[inside])
 
@@ -170,4 +170,4 @@ def _place(
     fraction[interval, slot] = place - interval
     placed[interval, slot] = readings
     present[interval, slot] = 1.0
-    return jnp.asarray(fraction), jnp.asarray(placed), jnp.asarray(present), np.stack([interval, slot], axis=1)
+    return on_device(fraction), on_device(placed), on_device(present), np.stack([interval, slot], axis=1)

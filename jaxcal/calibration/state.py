@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.cameras import CameraModel
+from jaxcal.estimation import on_device
 from jaxcal.trajectory import so3
 
 
@@ -164,10 +165,10 @@ class TargetState(eqx.Module):
 def flat_target(layout: SharedLayout) -> TargetState:
     """A target as it was stated: flat, its boards in one place."""
     return TargetState(
-        R_target_board=jnp.tile(jnp.eye(3), (layout.extra_boards, 1, 1)),
-        t_target_board=jnp.zeros((layout.extra_boards, 3)),
-        warp=jnp.zeros(2 * layout.warp),
-        offsets=jnp.zeros((layout.offsets, 3)),
+        R_target_board=on_device(np.tile(np.eye(3), (layout.extra_boards, 1, 1))),
+        t_target_board=on_device(np.zeros((layout.extra_boards, 3))),
+        warp=on_device(np.zeros(2 * layout.warp)),
+        offsets=on_device(np.zeros((layout.offsets, 3))),
     )
 
 
@@ -206,7 +207,6 @@ class RigState(eqx.Module):
         cameras = range(layout.num_cameras)
         poses = jnp.stack([shared[layout.pose(c)] for c in cameras])
         shifts = jnp.stack([shared[layout.shift(c)] for c in cameras])
-        exp = jax.vmap(so3.exp)
         gravity = self.gravity + layout.gravity_basis(self.gravity) @ shared[layout.gravity]
         if layout.gravity_size == 2:
             gravity = gravity * (jnp.linalg.norm(self.gravity) / jnp.linalg.norm(gravity))
@@ -215,13 +215,16 @@ class RigState(eqx.Module):
             step[imu.parameters :] if imu.placed else jnp.zeros(7) for step, imu in zip(steps, layout.imus, strict=True)
         ]
         moved = jnp.stack(places) if places else jnp.zeros((0, 7))
+        # One exponential of all turns: each by itself takes its time to compile.
+        turns = jax.vmap(so3.exp)(jnp.concatenate([chain[:, :3], poses[:, :3], moved[:, :3]]))
+        of_chain, of_cameras, of_imus = jnp.split(turns, [len(chain), len(chain) + len(poses)])
         return RigState(
             lenses=lenses,
-            R_cam_rig=exp(poses[:, :3]) @ self.R_cam_rig,
+            R_cam_rig=of_cameras @ self.R_cam_rig,
             t_cam_rig=self.t_cam_rig + poses[:, 3:],
             shift=self.shift + shifts,
             gravity=gravity,
-            rotations=self.rotations @ exp(chain[:, :3]),
+            rotations=self.rotations @ of_chain,
             positions=self.positions + chain[:, 3:6],
             biases=self.biases + chain[:, 6:],
             target=self.target.retract(layout, shared[layout.target]) if layout.target_size else self.target,
@@ -229,7 +232,7 @@ class RigState(eqx.Module):
                 values + step[: imu.parameters]
                 for values, step, imu in zip(self.imu_parameters, steps, layout.imus, strict=True)
             ),
-            R_imu_rig=exp(moved[:, :3]) @ self.R_imu_rig,
+            R_imu_rig=of_imus @ self.R_imu_rig,
             t_imu_rig=self.t_imu_rig + moved[:, 3:6],
             imu_shift=self.imu_shift + moved[:, 6],
             line_delay=self.line_delay + self._delay_steps(layout, shared) if layout.rolling else self.line_delay,

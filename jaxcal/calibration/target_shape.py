@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxcal.calibration.state import SharedLayout, TargetState
+from jaxcal.estimation import on_device
 from jaxcal.targets import Target
 
 
@@ -34,10 +35,10 @@ def geometry_of(target: Target, offset_sigma_m: float | None = None) -> TargetGe
         low, high = plane.min(axis=0), plane.max(axis=0)
         across[board == b] = (2.0 * plane - low - high) / np.maximum(high - low, 1e-12)
     return TargetGeometry(
-        points=jnp.asarray(target.points),
-        board=jnp.asarray(board),
-        across=jnp.asarray(across),
-        offset_sigma=jnp.asarray(_OFFSET_SIGMA_M if offset_sigma_m is None else float(offset_sigma_m)),
+        points=on_device(target.points),
+        board=on_device(board),
+        across=on_device(across),
+        offset_sigma=on_device(_OFFSET_SIGMA_M if offset_sigma_m is None else float(offset_sigma_m)),
     )
 
 

@@ -19,6 +19,7 @@ from jaxcal.calibration.state import RigState, SharedLayout, flat_target
 from jaxcal.calibration.target_shape import geometry_of
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
+from jaxcal.estimation import on_device
 from jaxcal.targets import Target
 
 _ORDER = 4
@@ -93,8 +94,8 @@ def continuous_problem(
         imu=_motion_prior(grid),
         prior=solving.lens_prior(lenses, layout, cameras),
         free_chain=jnp.ones((knots, 6), dtype=bool),
-        free=jnp.asarray(free),
-        loss_width=jnp.asarray(1.0),
+        free=on_device(free),
+        loss_width=on_device(1.0),
         basis=own_parameters(lenses, layout),
         layout=layout,
         order=_ORDER,
@@ -105,12 +106,12 @@ def continuous_problem(
     rotations, positions = spline_setup.first_chain(grid, time, R, time, p)
     state = RigState(
         lenses=solving.stack_lenses(lenses, layout),
-        R_cam_rig=jnp.asarray(np.stack(rotation)),
-        t_cam_rig=jnp.asarray(np.stack(arms)),
-        shift=jnp.asarray(shift),
+        R_cam_rig=on_device(np.stack(rotation)),
+        t_cam_rig=on_device(np.stack(arms)),
+        shift=on_device(shift),
         gravity=jnp.array([0.0, 0.0, -1.0]),
-        rotations=jnp.asarray(rotations),
-        positions=jnp.asarray(positions),
+        rotations=on_device(rotations),
+        positions=on_device(positions),
         biases=jnp.zeros((knots, 0)),
         target=flat_target(layout),
         line_delay=jnp.zeros(len(lenses) if layout.rolling else 0),
@@ -150,10 +151,10 @@ def _motion_prior(grid: SplineGrid) -> InertialData:
     """No IMU samples: only the weak prior that bridges the time between frames."""
     return InertialData(
         samples=(),
-        start=jnp.asarray(grid.start),
-        dt=jnp.asarray(grid.dt),
-        rate_sigma=jnp.asarray(_RATE_SIGMA),
-        acceleration_sigma=jnp.asarray(_ACCELERATION_SIGMA),
+        start=on_device(grid.start),
+        dt=on_device(grid.dt),
+        rate_sigma=on_device(_RATE_SIGMA),
+        acceleration_sigma=on_device(_ACCELERATION_SIGMA),
     )
 
 

@@ -14,7 +14,7 @@ from jaxcal.calibration.robust import corner_errors
 from jaxcal.calibration.state import TargetState, layout_of
 from jaxcal.calibration.views import associate, split_boards
 from jaxcal.errors import CalibrationError
-from jaxcal.estimation import solve
+from jaxcal.estimation import on_device, solve
 from jaxcal.observations import Detections
 from jaxcal.results import Calibration
 
@@ -96,8 +96,8 @@ def known_target(calibration: Calibration, warp: bool | None = None) -> TargetSt
         bend = (np.zeros(2) if bend is None else bend) if warp else None
     offsets = None if shape is None else shape.offsets_m
     return TargetState(
-        R_target_board=jnp.asarray(boards[:, :3, :3]),
-        t_target_board=jnp.asarray(boards[:, :3, 3]),
-        warp=jnp.zeros(0) if bend is None else jnp.asarray(bend),
-        offsets=jnp.zeros((0, 3)) if offsets is None else jnp.asarray(offsets),
+        R_target_board=on_device(boards[:, :3, :3]),
+        t_target_board=on_device(boards[:, :3, 3]),
+        warp=jnp.zeros(0) if bend is None else on_device(bend),
+        offsets=jnp.zeros((0, 3)) if offsets is None else on_device(offsets),
     )

@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -20,6 +21,8 @@ _START_ANGLES = 40
 _WIDEST = 0.98 * np.pi
 _UNPROJECT_STEPS = 10
 _LONGEST_STEP = 0.1
+# Arrays of vectors given from outside a program are filled up to a power of two, not below this.
+_FEWEST = 16
 _STEP_LENGTHS = np.array([1.0, 0.4, 0.1, 0.0])
 
 
@@ -70,13 +73,16 @@ class CameraModel(eqx.Module):
     @property
     def parameters(self) -> Float[Array, " n"]:
         """All parameters as one vector (n,), fields in order of their definition."""
-        return jnp.concatenate(
-            [jnp.ravel(jnp.asarray(getattr(self, f.name), dtype=jnp.float64)) for f in _fields(self)]
-        )
+        values = [getattr(self, f.name) for f in _fields(self)]
+        if any(isinstance(value, jax.core.Tracer) for value in values):
+            return jnp.concatenate([jnp.ravel(jnp.asarray(value, dtype=jnp.float64)) for value in values])
+        # Numbers at hand are put together without a program, which every model would need one of its own of.
+        return jax.device_put(np.concatenate([np.ravel(np.asarray(value, dtype=np.float64)) for value in values]))
 
     def with_parameters(self, parameters: Any) -> "CameraModel":
         """The same model with another parameter vector (n,). Raises CalibrationError when its length differs."""
-        parameters = jnp.asarray(parameters, dtype=float)
+        if not isinstance(parameters, jax.core.Tracer):
+            parameters = np.asarray(parameters, dtype=np.float64)  # slices of it need no programs
         if parameters.shape != (self.num_parameters,):
             raise CalibrationError(
                 f"camera model '{self.name or type(self).__name__}': parameters of shape {parameters.shape}; "
@@ -84,9 +90,11 @@ class CameraModel(eqx.Module):
             )
         values, start = [], 0
         for field in _fields(self):
-            old = jnp.asarray(getattr(self, field.name))
-            values.append(parameters[start : start + old.size].reshape(old.shape))
-            start += old.size
+            shape = np.shape(getattr(self, field.name))
+            size = math.prod(shape)
+            part = parameters[start : start + size].reshape(shape)
+            values.append(jax.device_put(part) if isinstance(part, np.ndarray) else part)
+            start += size
         names = [field.name for field in _fields(self)]
         return eqx.tree_at(lambda m: [getattr(m, n) for n in names], self, values)
 
@@ -166,7 +174,7 @@ class CameraModel(eqx.Module):
 
         Raises CalibrationError when the last axis is not 2.
         """
-        return _batched(_unproject, 2)(self, pixel)
+        return _unproject_all(self, pixel)
 
 
 @eqx.filter_jit
@@ -191,8 +199,7 @@ def _start(model: CameraModel, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
     rays = jnp.concatenate([jnp.sin(angles)[:, None] * azimuth, jnp.cos(angles)[:, None]], axis=1)
     reach = jax.vmap(lambda ray: (model.project(ray) - centre) @ arm)(rays) / wanted
     # Beyond the first angle at which the image stops moving outwards lies a fold, or the rear.
-    rising = jnp.cumprod(jnp.append(True, reach[1:] > reach[:-1]))
-    last = jnp.sum(rising) - 1
+    last = jnp.argmin(jnp.append(reach[1:] > reach[:-1], False))
     far = jnp.minimum(jnp.argmax(jnp.append(reach >= wanted, True)), last)
     near = jnp.maximum(far - 1, 0)
     share = jnp.clip((wanted - reach[near]) / jnp.maximum(reach[far] - reach[near], 1e-30), 0.0, 1.0)
@@ -226,23 +233,43 @@ def _solve(matrix: Float[Array, "2 2"], right: Float[Array, "2"]) -> Float[Array
 
 
 def _batched(of_one: Callable[[Any, Array], Array], size: int) -> Callable[[Any, Any], Array]:
-    """A method of one vector (size,), as a method of an array-like (..., size)."""
+    """A method of one vector (size,), as a method of an array-like (..., size).
+
+    Called outside of any program it becomes one: operation by operation each would be compiled for each shape.
+    """
+
+    def of_all(model: CameraModel, vectors: Array) -> Array:
+        return jax.vmap(functools.partial(of_one, model))(vectors)
+
+    program = eqx.filter_jit(of_all)
+
+    def at_once(model: CameraModel, vectors: np.ndarray) -> Array:
+        count = math.prod(vectors.shape[:-1])
+        padded = np.ones((max(_FEWEST, 1 << (count - 1).bit_length()), size))  # few shapes: few programs
+        padded[:count] = vectors.reshape(-1, size)
+        out = np.asarray(program(model, jax.device_put(padded)))[:count]
+        return jax.device_put(out.reshape(*vectors.shape[:-1], out.shape[-1]))
 
     @functools.wraps(of_one)
     def of_many(self: CameraModel, vectors: Any) -> Array:
-        vectors = jnp.asarray(vectors, dtype=float)
+        inside = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, vectors)))
+        vectors = jnp.asarray(vectors, dtype=float) if inside else np.asarray(vectors, dtype=float)
         if vectors.ndim == 0 or vectors.shape[-1] != size:
             raise CalibrationError(
                 f"camera model '{self.name or type(self).__name__}': {of_one.__name__.lstrip('_')} got an array of "
                 f"shape {vectors.shape}; expected (..., {size})."
             )
-        call = functools.partial(of_one, self)
+        if not inside:
+            return at_once(self, vectors)
         if vectors.ndim == 1:
-            return call(vectors)
-        out = jax.vmap(call)(vectors.reshape(-1, size))
+            return of_one(self, vectors)
+        out = of_all(self, vectors.reshape(-1, size))
         return out.reshape(*vectors.shape[:-1], out.shape[-1])
 
     return of_many
+
+
+_unproject_all = _batched(_unproject, 2)
 
 
 def _fields(model: CameraModel) -> list[dataclasses.Field[Any]]:

@@ -285,8 +285,8 @@ def _central(source: CameraModel, cls: type[CameraModel], image_size: tuple[int,
 def _limit(cls: type[CameraModel], image_size: tuple[int, int]) -> float:
     """Angle (rad) up to which a model is fitted by default."""
     edge = np.radians(_RIM_DEG)
-    beyond = jnp.array([np.sin(edge), 0.0, np.cos(edge)])
-    wide = any(bool(start.is_valid(beyond)) for start in cls.starts(1.0, image_size))
+    beyond = np.array([[np.sin(edge), 0.0, np.cos(edge)]])
+    wide = any(_valid(start, beyond).all() for start in cls.starts(1.0, image_size))
     return np.pi if wide else float(np.radians(_PLANE_LIMIT_DEG))
 
 

@@ -1,6 +1,7 @@
 """The engine: block-arrow least squares. Knows nothing of cameras or IMUs."""
 
 from jaxcal.estimation.adjoint import GaussNewtonAdjoint
+from jaxcal.estimation.arrays import on_device
 from jaxcal.estimation.block_arrow import (
     BlockArrow,
     BlockArrowFactor,
@@ -42,6 +43,7 @@ __all__ = [
     "damped_step",
     "factorise",
     "huber",
+    "on_device",
     "robust_loss",
     "scattered_band",
     "scattered_chain",

@@ -96,14 +96,11 @@ class BlockArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         ratio = jnp.where(jnp.isfinite(state.predicted), decrease / state.predicted, 1.0)
         damping, raise_by = _next_damping(accept, state.first, ratio, state.damping, state.raise_by)
 
-        step = self._finite_step(damping, equations)
         tolerance = jnp.maximum(self.rtol, options.get("rtol", 0.0)) * equations.cost + self.atol
-        # A damped step promises little where a direction is weak, however far the optimum lies along it: ask again.
         refusals = state.refusals + (state.probing & ~accept)
-        ask = accept & (step.predicted < tolerance) & (damping > _HARDLY_DAMPED) & (refusals < _MOST_REFUSALS)
-        free = jax.lax.cond(ask, lambda: self._finite_step(jnp.array(_HARDLY_DAMPED), equations), lambda: step)
-        further = ask & (free.predicted >= tolerance)
-        step, damping = _select(further, free, step), jnp.where(further, _HARDLY_DAMPED, damping)
+        probe = accept & (damping > _HARDLY_DAMPED) & (refusals < _MOST_REFUSALS)
+        step, further = self._far_enough_step(damping, equations, tolerance, probe)
+        damping = jnp.where(further, _HARDLY_DAMPED, damping)
         small = step.predicted < tolerance
         # A rejected step whose promise drowns in the rounding of the cost is as good as convergence.
         drowned = ~accept & (state.predicted < 1e-13 * equations.cost)
@@ -123,6 +120,32 @@ class BlockArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             history=state.history.at[jnp.minimum(state.iteration, _MAX_HISTORY - 1)].set(equations.cost),
         )
         return y, new_state, None
+
+    def _far_enough_step(
+        self, damping: Float[Array, ""], equations: BlockArrow, tolerance: Float[Array, ""], probe: Bool[Array, ""]
+    ) -> tuple[BlockStep, Bool[Array, ""]]:
+        """The damped step; or the hardly damped one, where `probe` allows it, the damped one promises less than the
+        tolerance and this more. And whether it is that one.
+
+        A damped step promises little where a direction is weak, however far the optimum lies along it. A loop of one or
+        two passes, since the linear algebra is compiled for each place where it stands in the program.
+        """
+        nothing = jax.tree.map(
+            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), eqx.filter_eval_shape(self._finite_step, damping, equations)
+        )
+
+        def ask(loop: tuple[Array, Array, BlockStep]) -> tuple[Array, Array, BlockStep]:
+            asked, _, before = loop
+            step = self._finite_step(jnp.where(asked == 0, damping, _HARDLY_DAMPED), equations)
+            further = (asked > 0) & (step.predicted >= tolerance)
+            return asked + 1, further, _select((asked == 0) | further, step, before)
+
+        def again(loop: tuple[Array, Array, BlockStep]) -> Bool[Array, ""]:
+            asked, _, step = loop
+            return (asked == 0) | ((asked == 1) & probe & (step.predicted < tolerance))
+
+        _, further, step = jax.lax.while_loop(again, ask, (jnp.array(0), jnp.array(False), nothing))
+        return step, further
 
     def _finite_step(self, damping: Float[Array, ""], equations: BlockArrow) -> BlockStep:
         """The damped step; where the matrix is not positive definite none, of which nothing is promised."""

@@ -10,6 +10,18 @@ function look(frame) {
   const pictures = Array.from(page.querySelectorAll("figure.frame svg"));
   const small = pictures.filter((svg) => svg.getBoundingClientRect().width < 100);
   const scene = page.querySelector("svg.turnable");
+  seen.push({
+    name: frame.name,
+    errors: window_.errors,
+    plots: plots.length,
+    empty: empty.map((svg) => svg.parentElement.querySelector("h4").textContent),
+    small: small.length,
+    overflow: page.documentElement.scrollWidth - window_.innerWidth,
+    scene: scene === null ? null : turn(scene, window_),
+  });
+}
+// What the lines of the rig are after each thing a mouse or a key does to it.
+function turn(scene, window_) {
   const places = () => Array.from(scene.querySelectorAll("polyline"), (line) => line.getAttribute("points")).join(";");
   const mouse = (kind, x, y) =>
     scene.dispatchEvent(new window_.PointerEvent(kind, { clientX: x, clientY: y, pointerId: 1, bubbles: true }));
@@ -24,15 +36,7 @@ function look(frame) {
   const keyed = places();
   scene.dispatchEvent(new window_.MouseEvent("dblclick", { bubbles: true }));
   const back = places();
-  seen.push({
-    name: frame.name,
-    errors: window_.errors,
-    plots: plots.length,
-    empty: empty.map((svg) => svg.parentElement.querySelector("h4").textContent),
-    small: small.length,
-    overflow: page.documentElement.scrollWidth - window_.innerWidth,
-    before: before, turned: turned, released: released, keyed: keyed, back: back,
-  });
+  return { before: before, turned: turned, released: released, keyed: keyed, back: back };
 }
 window.addEventListener("load", () => {
   for (const frame of document.querySelectorAll("iframe")) {

@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal.cameras import PinholeRadtan
 from jaxcal.observations import Detections, Frames
-from jaxcal.results import Calibration, CameraCalibration, ImuCalibration
+from jaxcal.results import Calibration, CameraCalibration, ImuCalibration, compare
+from jaxcal.results.cross_validation import CrossValidation, Evidence, Halves
 from jaxcal.targets import AprilGrid, Checkerboard, Target
 
 SIGMAS = {
@@ -59,6 +60,23 @@ def make_calibration(
         settings={"models": ["pinhole-radtan"] * cameras, "huber": 3.0, "knots_per_second": 20, "seed": seed},
         versions={"jaxcal": "0.1.0", "jax": "0.10.0"},
     )
+
+
+def make_cross_validation(one: Calibration, other: Calibration) -> CrossValidation:
+    """As if `one` had been split in turns without a difference, and in time into itself and `other`.
+
+    Its evidence, a lean lens and a rolling shutter, is of the rig's first and last camera.
+    """
+    first, last = one.cameras[0].name, one.cameras[-1].name
+    halves = (
+        Halves("in turns", compare(one, one), 11.0, 10, 0.36),
+        Halves("in time", compare(one, other), 60.0, 10, 3.6e-9),
+    )
+    evidence = (
+        Evidence("lens", first, 3.0, 2, 0.22, -0.5),
+        Evidence("rolling shutter", last, 99.0, 1, 2.5e-23, 90.0, step=0, value=1.2e-5),
+    )
+    return CrossValidation(halves, evidence, ("something was not tested",))
 
 
 def make_images(calibration: Calibration) -> dict[str, Frames]:

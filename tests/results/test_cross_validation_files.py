@@ -8,13 +8,13 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from synthetic_calibration import make_calibration
+from synthetic_calibration import make_calibration, make_cross_validation
 from test_report import assert_sound
 
 from jaxcal.cli import main
 from jaxcal.errors import CalibrationError
-from jaxcal.results import Calibration, compare, load_cross_validation, save_cross_validation
-from jaxcal.results.cross_validation import CrossValidation, Evidence, Halves
+from jaxcal.results import Calibration, load_cross_validation, save_cross_validation
+from jaxcal.results.cross_validation import CrossValidation, Evidence
 
 
 @pytest.fixture(scope="module")
@@ -24,16 +24,7 @@ def pair() -> Calibration:
 
 @pytest.fixture(scope="module")
 def found(pair: Calibration) -> CrossValidation:
-    other = make_calibration(2, False, seed=1, frames=10)
-    halves = (
-        Halves("in turns", compare(pair, pair), 11.0, 10, 0.36),
-        Halves("in time", compare(pair, other), 60.0, 10, 3.6e-9),
-    )
-    evidence = (
-        Evidence("lens", "cam0", 3.0, 2, 0.22, -0.5),
-        Evidence("rolling shutter", "cam1", 99.0, 1, 2.5e-23, 90.0, step=0, value=1.2e-5),
-    )
-    return CrossValidation(halves, evidence, ("something was not tested",))
+    return make_cross_validation(pair, make_calibration(2, False, seed=1, frames=10))
 
 
 def same(one: object, other: object) -> bool:
