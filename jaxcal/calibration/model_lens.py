@@ -1,4 +1,4 @@
-"""Any camera model as the lens of a small fit: two compiled programs of one fixed size serve all its calls."""
+"""Any camera model as the lens of a small fit: compiled programs of two fixed sizes serve all its calls."""
 
 from collections.abc import Callable
 
@@ -10,10 +10,9 @@ from jaxtyping import Array
 
 from jaxcal.calibration.generic_lens import Projection
 from jaxcal.cameras import CameraModel
-from jaxcal.estimation import on_device
 
-# Points per call: large enough to vectorise, small enough that padding costs nothing.
-_CHUNK = 4096
+# Points per call: large enough to vectorise, small enough that padding costs nothing; and where there are many.
+_CHUNK, _LARGE_CHUNK = 4096, 32768
 
 
 class ModelLens:
@@ -39,7 +38,7 @@ class ModelLens:
         outputs = []
         for chunk in _chunks(flat, fill=1.0):
             program = _with_lens if with_lens else _without_lens
-            outputs.append(program(self._template, on_device(parameters), on_device(chunk)))
+            outputs.append(program(self._template, parameters, chunk))
 
         def joined(part: int) -> np.ndarray:
             values = np.concatenate([np.asarray(output[part]) for output in outputs], axis=-1)[..., : len(flat)]
@@ -50,8 +49,9 @@ class ModelLens:
 
 
 def _chunks(rows: np.ndarray, fill: float) -> list[np.ndarray]:
-    padded = np.pad(rows, [(0, -len(rows) % _CHUNK), (0, 0)], constant_values=fill)
-    return np.split(padded, max(len(padded) // _CHUNK, 1))
+    size = _CHUNK if len(rows) <= _LARGE_CHUNK // 2 else _LARGE_CHUNK
+    padded = np.pad(rows, [(0, -len(rows) % size), (0, 0)], constant_values=fill)
+    return np.split(padded, max(len(padded) // size, 1))
 
 
 def _pixel(template: CameraModel, parameters: Array, point: Array) -> Array:
