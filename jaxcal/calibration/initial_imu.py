@@ -85,6 +85,7 @@ class TurnIntegral:
 
     @property
     def start_s(self) -> float:
+        """The time of the first sample."""
         return float(self._time[0])
 
 

@@ -30,6 +30,7 @@ class SplineGrid:
 
     @property
     def stop(self) -> float:
+        """The end of the part that is used, s."""
         return self.start + self.used * self.dt
 
     @property

@@ -78,6 +78,8 @@ class CameraCalibration:
 
     @property
     def reprojection_rms_px(self) -> float:
+        """Root mean square of the residuals' lengths (both coordinates together, as Kalibr counts), px, of the corners
+        used; NaN without any."""
         kept = self.residuals_px[self.used]
         return float(np.sqrt(np.mean(np.sum(kept**2, axis=1)))) if len(kept) else float("nan")
 

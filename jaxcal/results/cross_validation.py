@@ -57,14 +57,16 @@ class Evidence:
 
     @property
     def found(self) -> bool:
+        """Whether it is among the causes that were named."""
         return self.step is not None
 
     @property
     def sentence(self) -> str:
         """The cause with its evidence, in words."""
         told = f", by {1e6 * self.value:.1f} us a row" if self.cause == "rolling shutter" and self.value else ""
+        numbers = "number" if self.freedom == 1 else "numbers"
         return (
-            f"{self.subject}: {_WORDS[self.cause]}{told} ({self.freedom} numbers more would lower the squared errors "
+            f"{self.subject}: {_WORDS[self.cause]}{told} ({self.freedom} {numbers} more would lower the squared errors "
             f"by {self.gain:.0f}, and by {self.held_back:.0f} in views held back, where noise alone gives "
             f"{self.freedom} and less than nothing). {_REMEDIES[self.cause]}"
         )

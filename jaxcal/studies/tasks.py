@@ -49,6 +49,7 @@ class Payload:
 
     @functools.cached_property
     def moments(self) -> resample.Moments:
+        """The views of the base calibration and their times, looked up when first asked for."""
         assert self.base is not None
         return resample.moments_of(self.base)
 

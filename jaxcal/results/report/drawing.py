@@ -79,6 +79,7 @@ def image_panel(image_size: tuple[int, int]) -> tuple[Figure, Axes]:
 
 
 def label(axes: Axes, x: str, y: str) -> None:
+    """Names of both axes, in the page's ink."""
     axes.set_xlabel(x, color=INK, fontsize=_FONT_SIZE)
     axes.set_ylabel(y, color=INK, fontsize=_FONT_SIZE)
 
@@ -99,6 +100,7 @@ def note(axes: Axes, text: str, x: float = 0.98, y: float = 0.97) -> None:
 
 
 def legend(axes: Axes, **options: object) -> None:
+    """A legend in the page's colours; `options` as matplotlib's."""
     axes.legend(
         **{
             "fontsize": _FONT_SIZE - 1.0,
