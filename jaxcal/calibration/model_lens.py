@@ -35,10 +35,9 @@ class ModelLens:
     def _project_one(self, parameters: np.ndarray, points: np.ndarray, with_lens: bool) -> Projection:
         count, corners = points.shape[0], points.shape[-1]
         flat = points.swapaxes(-1, -2).reshape(-1, 3)
-        outputs = []
-        for chunk in _chunks(flat, fill=1.0):
-            program = _with_lens if with_lens else _without_lens
-            outputs.append(program(self._template, parameters, chunk))
+        # Programs take numpy arrays as they are, which is quicker than to put them on the device first.
+        program: Callable[..., tuple[Array, ...]] = _with_lens if with_lens else _without_lens
+        outputs = [program(self._template, parameters, chunk) for chunk in _chunks(flat, fill=1.0)]
 
         def joined(part: int) -> np.ndarray:
             values = np.concatenate([np.asarray(output[part]) for output in outputs], axis=-1)[..., : len(flat)]

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxcal.errors import CalibrationError
@@ -74,14 +75,14 @@ class CameraModel(eqx.Module):
     def parameters(self) -> Float[Array, " n"]:
         """All parameters as one vector (n,), fields in order of their definition."""
         values = [getattr(self, f.name) for f in _fields(self)]
-        if any(isinstance(value, jax.core.Tracer) for value in values):
+        if any(isinstance(value, Tracer) for value in values):
             return jnp.concatenate([jnp.ravel(jnp.asarray(value, dtype=jnp.float64)) for value in values])
         # Numbers at hand are put together without a program, which every model would need one of its own of.
         return jax.device_put(np.concatenate([np.ravel(np.asarray(value, dtype=np.float64)) for value in values]))
 
     def with_parameters(self, parameters: Any) -> "CameraModel":
         """The same model with another parameter vector (n,). Raises CalibrationError when its length differs."""
-        if not isinstance(parameters, jax.core.Tracer):
+        if not isinstance(parameters, Tracer):
             parameters = np.asarray(parameters, dtype=np.float64)  # slices of it need no programs
         if parameters.shape != (self.num_parameters,):
             raise CalibrationError(
@@ -252,7 +253,7 @@ def _batched(of_one: Callable[[Any, Array], Array], size: int) -> Callable[[Any,
 
     @functools.wraps(of_one)
     def of_many(self: CameraModel, vectors: Any) -> Array:
-        inside = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, vectors)))
+        inside = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((self, vectors)))
         vectors = jnp.asarray(vectors, dtype=float) if inside else np.asarray(vectors, dtype=float)
         if vectors.ndim == 0 or vectors.shape[-1] != size:
             raise CalibrationError(
