@@ -1,6 +1,7 @@
 """Any camera model as the lens of a small fit: compiled programs of two fixed sizes serve all its calls."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -36,7 +37,7 @@ class ModelLens:
         count, corners = points.shape[0], points.shape[-1]
         flat = points.swapaxes(-1, -2).reshape(-1, 3)
         # Programs take numpy arrays as they are, which is quicker than to put them on the device first.
-        program: Callable[..., tuple[Array, ...]] = _with_lens if with_lens else _without_lens
+        program = _with_lens if with_lens else _without_lens
         outputs = [program(self._template, parameters, chunk) for chunk in _chunks(flat, fill=1.0)]
 
         def joined(part: int) -> np.ndarray:
@@ -58,7 +59,7 @@ def _pixel(template: CameraModel, parameters: Array, point: Array) -> Array:
 
 
 @eqx.filter_jit
-def _with_lens(template: CameraModel, parameters: Array, points: Array) -> tuple[Array, Array, Array, Array]:
+def _with_lens(template: CameraModel, parameters: Any, points: Any) -> tuple[Array, Array, Array, Array]:
     """Pixels (2, M), Jacobian by the point (2, 3, M), validity (M), Jacobian by the lens (n, 2, M); all finite."""
 
     def one(point: Array) -> tuple[Array, Array, Array, Array]:
@@ -70,7 +71,7 @@ def _with_lens(template: CameraModel, parameters: Array, points: Array) -> tuple
 
 
 @eqx.filter_jit
-def _without_lens(template: CameraModel, parameters: Array, points: Array) -> tuple[Array, Array, Array]:
+def _without_lens(template: CameraModel, parameters: Any, points: Any) -> tuple[Array, Array, Array]:
     """As `_with_lens`, less the Jacobian by the lens."""
 
     def one(point: Array) -> tuple[Array, Array, Array]:
