@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc  # scipy.stats says the same, and takes half a second to import
 
 from jaxcal.calibration.assemble import split_groups
-from jaxcal.calibration.known import KnownProblem, known_problem
+from jaxcal.calibration.known import KnownProblem, known_problem, rank_of
 from jaxcal.calibration.lens_basis import to_parameters
 from jaxcal.calibration.model_errors import find_model_errors
 from jaxcal.calibration.resolve import recordings_of, resolve
@@ -24,6 +24,7 @@ from jaxcal.results.cross_validation import CrossValidation, Halves
 
 # Fewer views than this in a half make no calibration to be compared.
 _FEWEST_VIEWS = 8
+_FEWEST_OF_A_CAMERA = 4
 # IMU samples are kept this far beyond the frames of a half (s).
 _MARGIN_S = 0.2
 
@@ -73,15 +74,25 @@ def cross_validate(
 
 def _splits(known: KnownProblem) -> list[tuple[str, np.ndarray]]:
     """Which views (V,) are in the first half, for each way to take them apart."""
-    order = np.argsort(np.argsort(known.times_s, kind="stable"), kind="stable")
     distance = np.zeros(known.num_views)
     for c, view in enumerate(known.views):
         poses = known.calibration.cameras[c].T_cam_target
         assert poses is not None
         distance[view] = np.linalg.norm(poses[known.cameras[c].frames][:, :3, 3], axis=1)
-    near = np.argsort(np.argsort(distance, kind="stable"), kind="stable")
-    half = known.num_views // 2
-    return [("in turns", order % 2 == 0), ("in time", order < half), ("near and far", near < half)]
+    early, near = np.zeros((2, known.num_views), dtype=bool)
+    for own in known.halved_alone:
+        early[own] = rank_of(known.times_s[own]) < len(own) // 2
+        near[own] = rank_of(distance[own]) < len(own) // 2
+    splits = [("in turns", known.in_turns()), ("in time", early), ("near and far", near)]
+    for name, part in splits:
+        for camera, view in zip(known.calibration.cameras, known.views, strict=True):
+            fewest = min(int(part[view].sum()), int((~part[view]).sum()))
+            if fewest < _FEWEST_OF_A_CAMERA:
+                raise CalibrationError(
+                    f"cross-validation: {fewest} views of {camera.name} fall into one half ({name}); "
+                    f"{_FEWEST_OF_A_CAMERA} are the least. Record more views with this camera."
+                )
+    return splits
 
 
 def _moving_pictures(known: KnownProblem) -> bool:

@@ -60,6 +60,19 @@ class KnownProblem:
         """(P,) the shared coordinates that are estimated."""
         return np.asarray(self.problem.free)
 
+    @property
+    def halved_alone(self) -> list[np.ndarray]:
+        """Groups of views (V_g,) to be halved each by itself: all in one, or each camera's where views are one camera's
+        own. Taken together, halves of two that see at the same instants might hold one camera each."""
+        return [np.arange(self.num_views)] if self.tied else self.views
+
+    def in_turns(self) -> np.ndarray:
+        """(V,) every other view."""
+        first = np.zeros(self.num_views, dtype=bool)
+        for own in self.halved_alone:
+            first[own] = rank_of(self.times_s[own]) % 2 == 0
+        return first
+
     def errors(self, state: RigState) -> list[np.ndarray]:
         """Projection minus measurement (F, N, 2), px, of each camera."""
         return split_groups(self.layout, self.cameras, [np.asarray(e) for e in corner_errors(self.problem, state)])
@@ -157,6 +170,11 @@ def known_problem(
         problem = eqx.tree_at(lambda p: p.free, problem, on_device(free))
     since = (times - times.min()) * 1e-9
     return KnownProblem(calibration, cameras, views, since, kept, weights, noises, inflation, tied, problem, state)
+
+
+def rank_of(values: np.ndarray) -> np.ndarray:
+    """The place (n,) of each value among all, the first of equal ones first."""
+    return np.argsort(np.argsort(values, kind="stable"), kind="stable")
 
 
 def _dense(frames: CameraFrames, per_corner: np.ndarray) -> np.ndarray:

@@ -128,7 +128,9 @@ def _fall(equations: Equations, half: int, coefficients: np.ndarray) -> float:
 
 
 def _pinv(matrix: np.ndarray) -> np.ndarray:
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    diagonal = np.diag(matrix)
+    # What nothing was seen of stays as it is.
+    scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 0.0)
     return np.linalg.pinv(matrix * scale[:, None] * scale, rcond=1e-9, hermitian=True) * scale[:, None] * scale
 
 
@@ -145,7 +147,7 @@ def _equations(known: KnownProblem) -> Equations:
         for view, part in _frames(known, c, poses[c], errors[c], late, columns, total):
             parts[view].append(part)
     matrix, right = np.zeros((2, total, total)), np.zeros((2, total))
-    rank = np.argsort(np.argsort(known.times_s, kind="stable"), kind="stable")
+    second = ~known.in_turns()
     for view, own in enumerate(parts):
         if not own:
             continue
@@ -155,7 +157,7 @@ def _equations(known: KnownProblem) -> Equations:
         q, _ = np.linalg.qr(pose)
         directions -= q @ (q.T @ directions)
         residual -= q @ (q.T @ residual)
-        half = int(rank[view] % 2)
+        half = int(second[view])
         matrix[half] += directions.T @ directions
         right[half] += directions.T @ residual
     rows = 2 * sum(int(kept.sum()) for kept in known.kept)

@@ -1,5 +1,6 @@
 """Cross-validation: noise alone is not flagged, each error of the model is, by its right name."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,23 @@ def test_with_other_noise_the_p_values_are_spread_evenly(sound: Calibration) -> 
         found += any(evidence.found for evidence in tested)
     assert np.mean(np.array(p_values) < 0.5) == pytest.approx(0.5, abs=0.15)
     assert found <= 1
+
+
+def test_cameras_that_see_at_the_same_instants_are_each_halved() -> None:
+    made = calibrated(0, cameras=2)
+    # As with an IMU or time offsets: frames are views by themselves, two at each instant.
+    untied = dataclasses.replace(made, settings={**made.settings, "time_offsets": True})
+    known = known_problem(untied)
+    assert not known.tied
+    first = known.in_turns()
+    for view in known.views:
+        assert 0.4 < first[view].mean() < 0.6
+    found = cross_validate(untied)
+    assert not found.flagged
+    for half in found.halves:
+        assert np.isfinite(half.gain)
+        assert half.freedom == 16
+    assert all(np.isfinite(evidence.held_back) for evidence in found.evidence)
 
 
 @pytest.mark.slow
