@@ -79,7 +79,7 @@ class TurnIntegral:
         values = self._at(np.arange(self._time[0], self._time[-1], fine_s))
         out = np.full((len(spans), len(values)), np.nan, dtype=np.float32)
         for row, span in zip(out, spans, strict=True):
-            turn = values[span:] - values[: len(values) - span]
+            turn = values[span:] - values[: max(len(values) - span, 0)]
             row[: len(turn)] = np.sqrt(np.einsum("na,na->n", turn, turn)) / (span * fine_s)
         return out
 

@@ -65,7 +65,7 @@ def confirm_optimum(fit: RobustFit, cameras: Sequence[CameraFrames], *, max_step
         step = _displacement(fit, sigmas, rng)
         if step is None:
             return fit, []
-        start, halved = _left(fit, step, sigmas)
+        start, halved = _left(fit, *step, sigmas)
         result = solve(fit.problem, start, max_steps=max_steps)
         before, after = float(fit.result.equations.cost), float(result.equations.cost)
         logger.info("restart %d: cost %.9g, from %.9g", attempt, after, before)
@@ -179,11 +179,11 @@ def _uncertain(cost: float, worse: float | None) -> str:
     )
 
 
-def _left(fit: RobustFit, step: np.ndarray, sigmas: float) -> tuple[RigState, bool]:
+def _left(fit: RobustFit, step: np.ndarray, chain: np.ndarray, sigmas: float) -> tuple[RigState, bool]:
     """The state that is away from the optimum by a step (P,) of the shared parameters, so many sigmas along each of
-    their directions, or nearer where that is no place to start; and whether it had to be nearer."""
-    equations, before = fit.result.equations, float(fit.result.equations.cost)
-    chain = _following(equations, step)
+    their directions, and the chain's (K, B); or nearer where that is no place to start; and whether it had to be
+    nearer."""
+    before = float(fit.result.equations.cost)
     promised = 0.5 * sigmas**2 * int(np.sum(np.asarray(fit.problem.free)))
     for halving in range(_HALVINGS):
         share = 0.5**halving
@@ -217,13 +217,16 @@ def _following(equations: BlockArrow, shared: np.ndarray) -> np.ndarray:
     return solveh_banded(lower, force, lower=True).reshape(blocks, size)
 
 
-def _displacement(fit: RobustFit, sigmas: float, rng: np.random.Generator) -> np.ndarray | None:
-    """A step of the shared parameters (P,), so many sigmas along each of their directions, to either side; None where
-    directions are not determined."""
+def _displacement(fit: RobustFit, sigmas: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
+    """A step of the shared parameters (P,), so many sigmas along each of their directions, to either side, and that of
+    the chain (K, B) with it; None where directions, or poses, are not determined."""
     free = np.asarray(fit.problem.free)
     values, directions = shared_information(fit.result.equations, free)
     if not len(values) or values.min() <= 0:
         return None
     step = np.zeros(len(free))
     step[free] = directions @ (sigmas * rng.choice([-1.0, 1.0], size=len(values)) / np.sqrt(values))
-    return step
+    try:
+        return step, _following(fit.result.equations, step)
+    except np.linalg.LinAlgError:
+        return None

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from simulated_truth import (
     assert_within_sigmas,
     errors_in_sigmas,
@@ -23,6 +24,7 @@ from jaxcal import (
     calibrate_camera_imu,
     load_calibration,
 )
+from jaxcal.calibration import initial_imu
 from jaxcal.simulation import SimulatedRig, paper_rig, simulate_detections, simulate_imu
 from jaxcal.studies.truth import errors, perturbation
 
@@ -362,3 +364,12 @@ def test_an_unknown_spline_order_is_refused(rig: SimulatedRig, recording: Record
     detections, imu = recording
     with pytest.raises(CalibrationError, match="spline_order is 3"):
         calibrate_camera_imu(detections, imu, rig.target, spline_order=3)
+
+
+def test_an_imu_recording_shorter_than_a_frame_is_refused() -> None:
+    time = 0.1 * np.arange(40)
+    turn = 0.5 * np.stack([np.sin(3.0 * time), np.cos(2.0 * time), 0.0 * time], axis=1)
+    track = initial_imu.CameraTrack(time, Rotation.from_rotvec(turn).as_matrix(), np.zeros((40, 3)))
+    gyro = np.random.default_rng(0).normal(size=(8, 3))
+    with pytest.raises(CalibrationError, match="does not match the IMU"):
+        initial_imu.align(track, 0.005 * np.arange(8), gyro, "cam0")
