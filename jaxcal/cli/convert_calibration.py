@@ -23,7 +23,8 @@ def convert_calibration(source: Path, out: Path, format: str, imu: Path | None) 
 
     IN is a folder of jaxcal's, or a file or folder of any of these formats; which one is found out from its content.
     OUT is a folder, or the file itself (.yaml, .yml, .json, .txt). What a format cannot hold is said; a lens that it
-    cannot hold is refused: `jaxcal convert camera` re-fits it first.
+    cannot hold is refused: `jaxcal convert camera` re-fits it first. Of Kalibr's files, imu.yaml is what Kalibr writes
+    and OpenVINS' users start from, imu0.yaml what Kalibr's own --imu reads.
     """
     from dataclasses import replace
 

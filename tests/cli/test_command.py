@@ -14,6 +14,7 @@ from click.testing import CliRunner, Result
 from jaxcal import AprilGrid, Checkerboard, Detections, load_target
 from jaxcal.cli import main
 from jaxcal.results import load_calibration, load_camchain
+from jaxcal.results.interchange import calibration_of_file
 from jaxcal.targets import BoardSet, Charuco, CircleGrid
 
 CAMCHAIN = {
@@ -151,6 +152,15 @@ def test_a_lens_is_converted_and_everything_else_stays(tmp_path: Path) -> None:
     rays = np.array([[0.1, 0.2, 1.0], [-0.5, 0.2, 1.0], [0.6, -0.4, 1.0]])
     for ray in rays:
         np.testing.assert_allclose(after[1].model.project(ray), before[1].model.project(ray), atol=0.05)
+
+
+def test_lenses_of_a_result_are_converted_by_its_folder(tmp_path: Path) -> None:
+    calibration_of_file(written(tmp_path), AprilGrid(6, 6, 0.03, 0.3)).save(tmp_path / "result")
+    result = jaxcal("convert", "camera", tmp_path / "result", "--to", "pinhole-rational8", "--out", tmp_path / "a.yaml")
+    assert result.exit_code == 0, result.output
+    before, after = load_calibration(tmp_path / "result"), load_camchain(tmp_path / "a.yaml")
+    assert [camera.model.name for camera in after] == ["pinhole-rational8"] * 2
+    np.testing.assert_array_equal(after[1].T_cn_cnm1, before.cameras[1].T_cn_cnm1)
 
 
 def test_what_cannot_be_converted(tmp_path: Path) -> None:

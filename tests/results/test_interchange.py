@@ -130,6 +130,10 @@ def test_kalibrs_own_files_are_written_again_byte_for_byte(data_folder: Path, tm
     write_calibration(rig, tmp_path, "kalibr")
     for ours, theirs in (("camchain-imucam.yaml", "kalibr_camchain-imucam.yaml"), ("imu.yaml", "kalibr_imu.yaml")):
         assert (tmp_path / ours).read_text() == (folder / theirs).read_text()
+    # Kalibr reads the noise with nothing above it.
+    given, resulting = (yaml.safe_load((tmp_path / name).read_text()) for name in ("imu0.yaml", "imu.yaml"))
+    assert len(given) == 6
+    assert given.items() <= resulting["imu0"].items()
 
 
 def test_a_fisheye_has_kalibrs_name_in_its_files(tmp_path: Path) -> None:
@@ -142,7 +146,7 @@ def test_a_fisheye_has_kalibrs_name_in_its_files(tmp_path: Path) -> None:
 def test_a_camchain_alone_says_that_the_noise_is_elsewhere(tmp_path: Path) -> None:
     done = write_calibration(make_rig(["pinhole-radtan"], True, 0), tmp_path / "chain.yaml", "kalibr")
     assert [path.name for path in done.paths] == ["chain.yaml"]
-    assert done.notes == ("imu.yaml is written where a folder is named",)
+    assert done.notes == tuple(f"{name} is written where a folder is named" for name in ("imu.yaml", "imu0.yaml"))
 
 
 # --- OpenCV's reader: OpenVINS, VINS-Fusion, OpenCV ------------------------------------------------------------------

@@ -69,11 +69,17 @@ def recognises_openvins(document: Document) -> bool:
 
 
 def write_kalibr(rig: CalibratedRig) -> tuple[dict[str, str], tuple[str, ...]]:
-    """camchain.yaml, or camchain-imucam.yaml and imu.yaml."""
+    """camchain.yaml, or camchain-imucam.yaml, imu.yaml (as Kalibr writes it) and imu0.yaml (as Kalibr's --imu reads it).
+
+    Kalibr cannot read its own resulting imu.yaml: its ConfigReader wants the keys without 'imu0' above them.
+    """
     chain = to_yaml(chain_content(rig.cameras))
     if rig.imu is None:
         return {"camchain.yaml": chain}, ()
-    return {"camchain-imucam.yaml": chain, "imu.yaml": to_yaml(_noise(rig.imu))}, ()
+    noise = _noise(rig.imu)
+    given = {key: noise["imu0"][key] for key in (*_DENSITIES, "rostopic", "update_rate")}
+    flat = yaml.safe_dump(given, default_flow_style=False)
+    return {"camchain-imucam.yaml": chain, "imu.yaml": to_yaml(noise), "imu0.yaml": flat}, ()
 
 
 def write_openvins(rig: CalibratedRig) -> tuple[dict[str, str], tuple[str, ...]]:

@@ -34,7 +34,7 @@ REJECTED = "#e2574c"
 
 PANEL = (4.4, 3.3)  # inches; three abreast on a desk, one on a phone
 _FONT_SIZE = 9.0
-_TICKS = 5  # intervals along an axis, at most
+_TICKS = 4  # intervals along an axis, at most
 _SETTINGS_LOCK = threading.Lock()  # matplotlib's SVG writer reads process-wide settings
 _RASTER_DPI = 150
 _RASTER_COLOURS = 48  # dots of two colours and their blends: a palette is a quarter of the bytes
