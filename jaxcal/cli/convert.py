@@ -27,9 +27,9 @@ def camera(source: Path, model: str, cameras: tuple[str, ...], out: Path | None)
     jaxcal convert camera result/ --to pinhole-equi --camera cam1
 
     CALIBRATION is a result of jaxcal's or a file of any tool that `jaxcal convert calibration` reads; what --out names
-    is a camchain, which that command takes further. The residual is the new model's projection minus the old one's at a grid of pixels. Poses between cameras stay as
-    they are. Give uncertainties their due: a calibration with the new model itself is better where the residual is not
-    small against the corner noise.
+    is a camchain, which that command takes further. The residual is the new model's projection minus the old one's at
+    a grid of pixels. Poses between cameras stay as they are. Give uncertainties their due: a calibration with the new
+    model itself is better where the residual is not small against the corner noise.
     """
     from jaxcal.atomic import write_bytes
     from jaxcal.cameras import model_name

@@ -69,7 +69,7 @@ def recognises_openvins(document: Document) -> bool:
 
 
 def write_kalibr(rig: CalibratedRig) -> tuple[dict[str, str], tuple[str, ...]]:
-    """camchain.yaml, or camchain-imucam.yaml, imu.yaml (as Kalibr writes it) and imu0.yaml (as Kalibr's --imu reads it).
+    """camchain.yaml, or camchain-imucam.yaml, imu.yaml as Kalibr writes it and imu0.yaml as Kalibr's --imu reads it.
 
     Kalibr cannot read its own resulting imu.yaml: its ConfigReader wants the keys without 'imu0' above them.
     """
