@@ -100,21 +100,23 @@ def main() -> int:
     done = {row.number for row in read_rows(file)}
     jobs = [(arguments.seed, number, arguments.models) for number in range(arguments.problems) if number not in done]
     context = multiprocessing.get_context("spawn")
+    # Processes are renewed, or the compiled programs of all models fill the memory; by new pools, since a pool that
+    # renews them itself stops for ever when the last one has had its share (python/cpython issue 115634).
+    batch = TASKS_PER_PROCESS * arguments.workers
     with (
-        # Processes are renewed, or the compiled programs of all models fill the memory.
-        concurrent.futures.ProcessPoolExecutor(
-            arguments.workers, mp_context=context, max_tasks_per_child=TASKS_PER_PROCESS
-        ) as pool,
         file.open("a", newline="") as stream,
         tqdm(total=arguments.problems, initial=arguments.problems - len(jobs), unit="problem") as bar,
     ):
         writer = csv.writer(stream)
         if stream.tell() == 0:
             writer.writerow([field.name for field in dataclasses.fields(Row)])
-        for future in concurrent.futures.as_completed([pool.submit(run_one, *job) for job in jobs]):
-            writer.writerow(dataclasses.astuple(future.result()))
-            stream.flush()
-            bar.update()
+        for start in range(0, len(jobs), batch):
+            with concurrent.futures.ProcessPoolExecutor(arguments.workers, mp_context=context) as pool:
+                some = [pool.submit(run_one, *job) for job in jobs[start : start + batch]]
+                for future in concurrent.futures.as_completed(some):
+                    writer.writerow(dataclasses.astuple(future.result()))
+                    stream.flush()
+                    bar.update()
     table = table_of(read_rows(file))
     (arguments.output / "table.md").write_text(table)
     print(table)

@@ -56,7 +56,10 @@ _NOT_NEEDED = all_of(
 @click.option("--export-poses", is_flag=True, help="Write where the camera stood in each view, as a csv.")
 @click.option("--workers", type=int, help="Processes for detection (one per core).")
 @click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), help="Folder for the results (with --bag: BAG-jaxcal)."
+    "--out",
+    "--output",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder for the results (with --bag: BAG-jaxcal).",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 @VERBOSE

@@ -66,7 +66,9 @@ _NOT_NEEDED = all_of(
 @click.option("--max-iter", type=int, help="Iterations at most (60).")
 @click.option("--export-poses", is_flag=True, help="Write the motion of the IMU as a csv.")
 @click.option("--workers", type=int, help="Processes for detection (one per core).")
-@click.option("--out", type=click.Path(file_okay=False, path_type=Path), help="Folder for the results (BAG-jaxcal).")
+@click.option(
+    "--out", "--output", type=click.Path(file_okay=False, path_type=Path), help="Folder for the results (BAG-jaxcal)."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 @VERBOSE
 @_NOT_NEEDED
@@ -194,6 +196,7 @@ def _rig(
 
 
 def _imus(bag: Path, given: dict[str, Any]) -> "tuple[tuple[RigImu, ...], list[str | None]]":
+    from jaxcal.errors import CalibrationError
     from jaxcal.imu import imu_model
     from jaxcal.recording import RigImu, load_noise
     from jaxcal.recording.sources import imu_source
@@ -207,7 +210,13 @@ def _imus(bag: Path, given: dict[str, Any]) -> "tuple[tuple[RigImu, ...], list[s
         noise = load_noise(file)
         content = read_mapping(file, "imu.yaml")
         topic = content.get("imu0", content).get("rostopic")
-        imus.append(RigImu(imu_source(bag, topic), noise, imu_model(model).name))
+        try:
+            source = imu_source(bag, topic)
+        except CalibrationError as error:
+            if topic is None:
+                raise
+            raise CalibrationError(f"{error} The topic comes from 'rostopic' in {file}: correct it there.") from error
+        imus.append(RigImu(source, noise, imu_model(model).name))
         topics.append(topic)
     return tuple(imus), topics
 

@@ -17,7 +17,10 @@ def convert() -> None:
 @click.option("--to", "model", required=True, help="The model wanted: a name such as ds-none, or module:Class.")
 @click.option("--camera", "cameras", multiple=True, help="Only this camera, such as cam0; may be repeated (all).")
 @click.option(
-    "--out", type=click.Path(dir_okay=False, path_type=Path), help="Camchain to write; without it, only the residuals."
+    "--out",
+    "--output",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Camchain to write; without it, only the residuals.",
 )
 def camera(source: Path, model: str, cameras: tuple[str, ...], out: Path | None) -> None:
     """Fit another lens model to calibrated ones, over the whole image, and say how far apart they are.

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 @click.option(
     "--target", "target_file", required=True, type=click.Path(dir_okay=False, path_type=Path), help="target.yaml"
 )
-@click.option("--out", required=True, type=click.Path(dir_okay=False, path_type=Path), help="File to write, .npz.")
+@click.option(
+    "--out", "--output", required=True, type=click.Path(dir_okay=False, path_type=Path), help="File to write, .npz."
+)
 @click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Draw it: out.png, .svg or .pdf.")
 @click.option("--from-to", nargs=2, type=float, metavar="START END", help="Use this part only; s after the start.")
 @click.option("--rate", type=float, help="Use at most so many images a second.")

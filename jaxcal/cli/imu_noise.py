@@ -14,7 +14,7 @@ _PICTURES = (".png", ".svg", ".pdf")
 
 @click.command("imu-noise")
 @click.argument("still")
-@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="Kalibr's imu.yaml to write.")
+@click.option("--out", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Kalibr's imu.yaml to write.")
 @click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Draw it: allan.png, .svg or .pdf.")
 @click.option(
     "--inflate",

@@ -17,7 +17,9 @@ _FILL_IN = "FILL IN"
 @click.option("--target", type=click.Path(dir_okay=False, path_type=Path), help="target.yaml of the board recorded.")
 @click.option("--imu", type=click.Path(dir_okay=False, path_type=Path), help="imu.yaml with the IMU's noise.")
 @click.option("--model", default="pinhole-radtan", show_default=True, help="Lens model of the cameras.")
-@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="File to write (rig.yaml in the folder).")
+@click.option(
+    "--out", "--output", type=click.Path(dir_okay=False, path_type=Path), help="File to write (rig.yaml in the folder)."
+)
 @click.option("--force", is_flag=True, help="Replace the file where it is there already.")
 def init(recording: Path, target: Path | None, imu: Path | None, model: str, out: Path | None, force: bool) -> None:
     """Look at a recording and write the rig.yaml for it.

@@ -39,7 +39,7 @@ def _for_the_screen(command: Any) -> Any:
 @click.command(context_settings={"token_normalize_func": lambda name: name.replace("-", "_"), "max_content_width": 110})
 @click.argument("source", metavar="[EVENTS]", required=False)
 @click.option("--h5file", "--input_file", "-i", "named_source", hidden=True)
-@click.option("--output", type=_FILE, help="Folder for the frames: data.csv and data/<time in ns>.png.")
+@click.option("--output", "--out", type=_FILE, help="Folder for the frames: data.csv and data/<time in ns>.png.")
 @click.option("--output_folder", "-o", type=_FILE, help="As e2calib: the frames go to its subfolder --dataset_name.")
 @click.option("--dataset_name", default="e2calib", show_default=True, help="See --output_folder.")
 @click.option("--overwrite", is_flag=True, help="Take the place of other frames in the folder.")

@@ -16,7 +16,9 @@ from jaxcal.cli.outcome import RERUN_FILE
     metavar="NAME=FOLDER",
     help="Pictures of a camera, to show its corners on: cam0=left/; may be repeated.",
 )
-@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="File to write (RESULT/report.html).")
+@click.option(
+    "--out", "--output", type=click.Path(dir_okay=False, path_type=Path), help="File to write (RESULT/report.html)."
+)
 @click.option("--rerun", type=RERUN_FILE, help="Write a log for the Rerun viewer, too: out.rrd (jaxcal[rerun]).")
 def report(result: Path, sources: tuple[str, ...], out: Path | None, rerun: Path | None) -> None:
     """Write the report of a saved calibration, one HTML page that needs nothing else.

@@ -43,6 +43,7 @@ _ONLY = {
 @click.option("--page", default="auto", show_default=True, help="auto, A4 .. A0, letter, or a size in mm: 600x400.")
 @click.option(
     "--out",
+    "--output",
     "outputs",
     required=True,
     multiple=True,

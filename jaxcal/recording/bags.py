@@ -85,7 +85,10 @@ class Bag:
         named = [topic for topic in topics if topic.name in (wanted, f"/{wanted}")] if wanted is not None else suitable
         listed = ", ".join(f"{topic.name} ({topic.kind}, {topic.count})" for topic in topics) or "none"
         if wanted is not None and not named:
-            raise CalibrationError(f"{self.path}: there is no topic '{wanted}'. The topics are: {listed}.")
+            instead = f" Did you mean '{suitable[0].name}'?" if len(suitable) == 1 else ""
+            raise CalibrationError(
+                f"{self.path}: there is no topic '{wanted}' for {what}.{instead} The topics are: {listed}."
+            )
         if not named:
             raise CalibrationError(
                 f"{self.path}: there are no {what} in the bag; expected messages of {' or '.join(kinds)}. The topics "

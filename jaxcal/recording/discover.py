@@ -77,6 +77,12 @@ def discover(path: str | Path) -> Found:
     return found
 
 
+def _rows(table: Path) -> int:
+    """Rows of a csv below its heading."""
+    with table.open(errors="replace") as lines:
+        return sum(1 for line in lines if line[:1].isdigit())
+
+
 def _folder(folder: Path, found: Found, depth: int) -> None:
     if any((folder / name).exists() for name in _RESULTS):
         found.remarks.append(f"{folder}: results of a calibration, passed over")
@@ -112,7 +118,7 @@ def _files(folder: Path, found: Found) -> None:
             _table(file, found)
         elif suffix == ".csv" and _is_imu_csv(file):
             name = f"{file.parent.name}/{file.name}" if file.name == "data.csv" else file.name
-            found.imus.append(FoundImu(str(file), name))
+            found.imus.append(FoundImu(str(file), f"{name}, {_rows(file)} measurements"))
         elif is_bag(file):
             _bag(file, found)
     numbered = {pattern: files for pattern, files in images.items() if "*" in pattern and len(files) >= _MIN_IMAGES}

@@ -46,7 +46,13 @@ NOISE = {
 
 
 def run(command: str, arguments: str, folder: Path) -> Result:
-    places = {"BAG": "drive", "TARGET": "target.yaml", "CHAIN": "chain.yaml", "IMU": "imu.yaml"}
+    places = {
+        "BAG": "drive",
+        "TARGET": "target.yaml",
+        "CHAIN": "chain.yaml",
+        "IMU": "imu.yaml",
+        "OTHER_IMU": "other_imu.yaml",
+    }
     words = [str(folder / places[word]) if word in places else word for word in arguments.split()]
     return CliRunner().invoke(main, [command, *words], catch_exceptions=False)
 
@@ -61,6 +67,7 @@ def drive(tmp_path: Path) -> Path:
     (tmp_path / "drive" / "imu0.csv").write_text("1,0,0,0,0,0,9.8\n2,0,0,0,0,0,9.8\n")
     (tmp_path / "target.yaml").write_text(yaml.safe_dump(AprilGrid(6, 6, 0.088, 0.3).to_yaml()))
     (tmp_path / "imu.yaml").write_text(yaml.safe_dump(NOISE))
+    (tmp_path / "other_imu.yaml").write_text(yaml.safe_dump(NOISE | {"rostopic": "/imu7"}))
     camera = {
         "camera_model": "pinhole",
         "distortion_model": "equidistant",
@@ -144,6 +151,7 @@ def test_older_and_shorter_ways(drive: Path, walked: dict[str, Any], words: str)
         ("calibrate-imu-camera", "--bag BAG --imu IMU --target TARGET --cam CHAIN --models a", 2, "--models come from"),
         ("calibrate-imu-camera", "--bag BAG --imu IMU --target TARGET --cam CHAIN --topics /cam0", 2, "has 2 cameras"),
         ("calibrate-imu-camera", "--bag BAG --imu IMU --target TARGET --cam absent.yaml", 1, "absent.yaml: no such"),
+        ("calibrate-imu-camera", "--bag BAG --imu OTHER_IMU --target TARGET --cam CHAIN", 1, "other_imu.yaml: correct"),
         ("calibrate-imu-camera", "--bag nowhere --imu IMU --target TARGET --cam CHAIN", 1, "nowhere: no such bag or"),
     ],
 )

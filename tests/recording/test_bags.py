@@ -186,7 +186,7 @@ def test_choice_of_topics(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"2 topics with events. Say which: .*drive.bag:/dvs/events or .*/event"):
         EventFile(path)
     with pytest.raises(
-        CalibrationError, match=r"no topic '/dvs'. The topics are: /dvs/events .dvs_msgs/msg/EventArray"
+        CalibrationError, match=r"no topic '/dvs' for events. The topics are: /dvs/events .dvs_msgs/msg/EventArray"
     ):
         EventFile(f"{path}:/dvs")
     with EventFile(f"{path}:dvs/events") as file:

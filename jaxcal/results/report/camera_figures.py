@@ -1,6 +1,7 @@
 """The figures of one camera: where its corners were, and what its residuals look like."""
 
 import numpy as np
+from matplotlib.collections import PatchCollection
 from matplotlib.patches import Circle, Rectangle
 
 from jaxcal.results.calibration import CameraCalibration
@@ -72,9 +73,11 @@ def _coverage_picture(camera: CameraCalibration, prefix: str) -> Picture:
     counts = corner_counts(camera)
     width, height = camera.image_size
     down, across = counts.shape
-    for row, col in np.argwhere(counts == 0):
-        corner = (col * width / across - 0.5, row * height / down - 0.5)
-        axes.add_patch(Rectangle(corner, width / across, height / down, facecolor=WARN, edgecolor="none", alpha=0.22))
+    empty = [
+        Rectangle((col * width / across - 0.5, row * height / down - 0.5), width / across, height / down)
+        for row, col in np.argwhere(counts == 0)
+    ]
+    axes.add_collection(PatchCollection(empty, facecolor=WARN, edgecolor="none", alpha=0.22))
     x, y = camera.detections.pixels[camera.used].T
     axes.plot(x, y, ".", markersize=1.6, color=POINT, alpha=_faintness(2 * len(x)), rasterized=True)
     rejected = camera.detections.pixels[~camera.inlier]
