@@ -11,7 +11,7 @@ from typing import Any
 from jaxcal.calibration import calibrate_camera_imu, calibrate_cameras, cross_validate
 from jaxcal.cameras import camera_model
 from jaxcal.detection import detect
-from jaxcal.event_frames import frames_key, write_event_frames
+from jaxcal.event_frames import LAG_SIGMA_S, frames_key, write_event_frames
 from jaxcal.job_options import job_options
 from jaxcal.observations import Detections, Frames, ImuRecording
 from jaxcal.progress import Progress, no_progress
@@ -124,6 +124,7 @@ def _calibrated(
         "models": [camera.model for camera in rig.cameras],
         "names": [camera.name for camera in rig.cameras],
         "rolling_shutter": [camera.rolling_shutter for camera in rig.cameras],
+        "stamp_sigma_s": [0.0 if camera.events is None else LAG_SIGMA_S for camera in rig.cameras],
         "progress": progress,
     }
     if not imus:

@@ -22,6 +22,7 @@ from jaxcal.calibration.rolling import row_intervals, shutters_of
 from jaxcal.calibration.spline_setup import BinnedImu, SplineGrid
 from jaxcal.calibration.state import RigState, SharedLayout, flat_target, layout_of
 from jaxcal.calibration.target_shape import TargetGeometry, geometry_of
+from jaxcal.calibration.uncertainty import stamp_sigmas_of, with_common_delay
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.estimation import LOSSES, Loss, on_device
@@ -57,6 +58,7 @@ def calibrate_camera_imu(
     loss: Loss = "huber",
     spline_order: int = 6,
     knot_rate_hz: float | None = None,
+    stamp_sigma_s: float | Sequence[float] = 0.0,
     max_steps: int = 60,
     progress: Progress = no_progress,
 ) -> Calibration:
@@ -76,7 +78,9 @@ def calibrate_camera_imu(
     residuals show, larger or smaller. `board_warp`, `point_offset_sigma_m`: how the board is bent, and where its points
     are, as for `calibrate_cameras` (offsets of all points are three unknowns each: slow). `loss`: the robust loss under
     which outlying corners are found, as for `calibrate_cameras`; they are left out of the final least squares.
-    `spline_order` 4 to 6 and `knot_rate_hz`, chosen from the first IMU's own spectrum by default.
+    `spline_order` 4 to 6 and `knot_rate_hz`, chosen from the first IMU's own spectrum by default. `stamp_sigma_s`, for
+    all cameras or one each: 1-sigma of a delay that all time stamps of the camera share and no measurement shows, such
+    as the lag of frames made of events; it goes into the sigma of the time offset.
 
     Raises CalibrationError when frames and IMU do not overlap or do not move together, and as `calibrate_cameras`.
     """
@@ -87,6 +91,7 @@ def calibrate_camera_imu(
 
     imus = [imu] if isinstance(imu, ImuRecording) else list(imu)
     imu_names = _imu_models(imu_models, len(imus))
+    stamp_sigmas = stamp_sigmas_of(stamp_sigma_s, len(names))
     first = imus[0]
     imu_time = (first.timestamps_ns - first.timestamps_ns[0]) * 1e-9
     start = _align_all(names, lenses, frames, target, first, imu_time)
@@ -134,6 +139,7 @@ def calibrate_camera_imu(
         "loss": loss,
         "spline_order": spline_order,
         "knot_rate_hz": 1.0 / grid.dt,
+        "stamp_sigma_s": stamp_sigmas,
         "max_steps": max_steps,
     }
     return calibration_from(
@@ -142,7 +148,7 @@ def calibrate_camera_imu(
         frames,
         usable,
         target,
-        covariance=covariance,
+        covariance=with_common_delay(covariance, layout, stamp_sigmas, to_first_camera=False),
         imus=results,
         warnings=[*sentences, *noise.warnings(fit)],
         settings=settings,

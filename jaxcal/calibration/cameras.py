@@ -19,6 +19,7 @@ from jaxcal.calibration.rig_graph import RigGraph, Sightings
 from jaxcal.calibration.robust import robust_fit
 from jaxcal.calibration.rolling import shutters_of
 from jaxcal.calibration.state import RigState, SharedLayout, layout_of
+from jaxcal.calibration.uncertainty import stamp_sigmas_of, with_common_delay
 from jaxcal.calibration.unsynchronised import continuous_problem
 from jaxcal.calibration.views import BoardFrames, associate, split_boards
 from jaxcal.cameras import CameraModel, model_name
@@ -43,6 +44,7 @@ def calibrate_cameras(
     board_warp: bool = False,
     point_offset_sigma_m: float | None = None,
     loss: Loss = "huber",
+    stamp_sigma_s: float | Sequence[float] = 0.0,
     max_steps: int = 300,
     progress: Progress = no_progress,
 ) -> Calibration:
@@ -60,7 +62,8 @@ def calibrate_cameras(
     `views`: use only that many views, chosen so that they tell most (`selection`). `board_warp` estimates how the
     board is bent (two numbers); `point_offset_sigma_m` lets every point of the target move, under a prior of that
     1-sigma in metres. `loss`: the robust loss under which outliers are found; they are left out of the final least
-    squares. The corner noise of each camera is estimated from its residuals. The optimum is confirmed by a restart from
+    squares. `stamp_sigma_s`: as for `calibrate_camera_imu`, for the sigmas of `time_offsets`. The corner noise of each
+    camera is estimated from its residuals. The optimum is confirmed by a restart from
     ten sigmas away.
 
     Raises CalibrationError when a camera has too few views, when no lens explains them, or when nothing connects the
@@ -70,6 +73,7 @@ def calibrate_cameras(
     names = resolve_names(detections, names)
     shutters = shutters_of(rolling_shutter, len(detections))
     time_offsets = time_offsets or any(shutters)
+    stamp_sigmas = stamp_sigmas_of(stamp_sigma_s, len(detections))
     _check_options(target, time_offsets, views, loss)
     cameras = [camera_frames(d, target, name) for d, name in zip(detections, names, strict=True)]
     look = _first_look(names, classes, cameras, target, progress)
@@ -107,6 +111,7 @@ def calibrate_cameras(
         "board_warp": board_warp,
         "point_offset_sigma_m": point_offset_sigma_m,
         "loss": loss,
+        "stamp_sigma_s": stamp_sigmas,
         "max_steps": max_steps,
     }
     return calibration_from(
@@ -115,7 +120,7 @@ def calibrate_cameras(
         joint.cameras,
         joint.usable,
         target,
-        covariance=covariance,
+        covariance=with_common_delay(covariance, layout, stamp_sigmas, to_first_camera=True),
         warnings=[*look.sentences, *joint.sentences, *restart, *sentences],
         settings=settings,
         with_time=time_offsets,

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxcal.calibration.state import RigState, SharedLayout
 from jaxcal.cameras import CameraModel
+from jaxcal.errors import CalibrationError
 from jaxcal.estimation import BlockArrow, factorise, single_threaded_blas
 from jaxcal.imu import imu_model
 
@@ -96,6 +97,33 @@ def labels_of(names: Sequence[str], models: Sequence[CameraModel], layout: Share
 
 def _hat(v: np.ndarray) -> np.ndarray:
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+def stamp_sigmas_of(sigma_s: float | Sequence[float], cameras: int) -> list[float]:
+    """The 1-sigma of the delay of each camera's time stamps, s. Raises CalibrationError when there are not as many
+    numbers as cameras, or one is negative."""
+    sigmas = [float(sigma_s)] * cameras if isinstance(sigma_s, int | float) else [float(one) for one in sigma_s]
+    if len(sigmas) != cameras or not all(0.0 <= sigma < np.inf for sigma in sigmas):
+        raise CalibrationError(
+            f"`stamp_sigma_s` is {sigma_s!r}; expected seconds, zero or more: one number for all {cameras} cameras or "
+            "one each."
+        )
+    return sigmas
+
+
+def with_common_delay(
+    covariance: np.ndarray, layout: SharedLayout, sigmas_s: Sequence[float], *, to_first_camera: bool
+) -> np.ndarray:
+    """Covariance (P, P) of the shared vector with a delay in it that all stamps of a camera share.
+
+    Corners and IMU cannot tell such a delay from a time offset: offsets alone become less certain. `sigmas_s` by
+    camera; their cause is taken for one and the same (the network that makes frames of events), so that what cameras
+    have in common cancels between them. `to_first_camera`: offsets are to the first camera's clock, not the IMU's.
+    """
+    delay = np.zeros(len(covariance))
+    for c, sigma in enumerate(sigmas_s):
+        delay[layout.shift(c)] = sigma - (sigmas_s[0] if to_first_camera else 0.0)
+    return covariance + np.outer(delay, delay)
 
 
 def named_covariance(

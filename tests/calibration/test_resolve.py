@@ -66,6 +66,10 @@ def test_held_lenses_are_in_the_result_itself(with_imu: Calibration) -> None:
     np.testing.assert_array_equal(held.cameras[0].model.parameters, with_imu.cameras[0].model.parameters)
     assert held.settings["intrinsics"] == "held"
     assert_equal(resolve(held), held)
+    lagging = resolve(held, stamp_sigma_s=4e-4)
+    (offset,), (more,) = (np.asarray(c.std("cam0.timeshift_cam_imu")) for c in (held, lagging))
+    assert more == pytest.approx(np.hypot(offset, 4e-4), rel=1e-6)
+    np.testing.assert_allclose(lagging.std("cam0.T_cam_imu"), held.std("cam0.T_cam_imu"), rtol=1e-6)
 
 
 def test_other_settings_and_fewer_frames_are_taken(stereo: Calibration) -> None:

@@ -1,8 +1,10 @@
 """The corridor: from files to a calibration, with everything cached that took long."""
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,9 +19,11 @@ import yaml
 from jaxcal import Calibration, CalibrationError, Checkerboard, Detections, compare, run_pipeline
 from jaxcal import pipeline as pipeline_module
 from jaxcal.cameras import PinholeRadtan
+from jaxcal.event_frames import LAG_SIGMA_S
 from jaxcal.observations import Events, Frames
 from jaxcal.pipeline import PipelineSettings
-from jaxcal.recording import EventFile, convert_events
+from jaxcal.progress import no_progress
+from jaxcal.recording import EventFile, convert_events, load_rig
 from jaxcal.results import load_cross_validation
 from jaxcal.results.cross_validation import CrossValidation, Evidence, Halves
 
@@ -228,6 +232,22 @@ def test_a_part_of_the_recording(event_rig: Path, network: SimpleNamespace, hand
     event_rig.write_text(yaml.safe_dump(content | {"from_to": [5, 6]}))
     with pytest.raises(CalibrationError, match=r"cam2: no frame lies between 5.00 s and 6.00 s"):
         run_pipeline(event_rig, event_rig.parent / "out", settings=FAST)
+
+
+def test_frames_made_of_events_have_stamps_that_may_lag(event_rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*_: Any, stamp_sigma_s: Any, **__: Any) -> None:
+        raise CalibrationError(f"sigmas {stamp_sigma_s}")
+
+    monkeypatch.setattr(pipeline_module, "calibrate_cameras", stop)
+    both = load_rig(event_rig)
+    one = replace(both, cameras=(replace(both.cameras[0], events=None, frames=Path()), both.cameras[1]))
+    for rig, options, sigmas in (
+        (both, {}, [LAG_SIGMA_S, LAG_SIGMA_S]),
+        (one, {}, [0.0, LAG_SIGMA_S]),
+        (one, {"stamp_sigma_s": 1e-4}, 1e-4),
+    ):
+        with pytest.raises(CalibrationError, match=re.escape(f"sigmas {sigmas}")):
+            pipeline_module._calibrated(rig, [], [], options, no_progress)
 
 
 def test_options_of_the_job_are_checked_before_any_work(event_rig: Path, network: SimpleNamespace) -> None:
