@@ -124,7 +124,7 @@ def calibrate_camera_imu(
         progress=progress,
         reweigh=noise.reweigh,
     )
-    covariance, chain, sentences = chain_covariance_and_sentences(fit, names, lenses)
+    covariance, chain, sentences = chain_covariance_and_sentences(fit, names, lenses, frames)
     results = imu_results.imu_calibrations(fit, imus, noise, chain, grid)
     settings = {
         "job": "calibrate_camera_imu",

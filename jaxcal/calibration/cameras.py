@@ -100,7 +100,7 @@ def calibrate_cameras(
         progress=progress,
     )
     fit, restart = confirm_optimum(fit, joint.cameras, max_steps=max_steps)
-    covariance, _, sentences = chain_covariance_and_sentences(fit, names, look.lenses)
+    covariance, _, sentences = chain_covariance_and_sentences(fit, names, look.lenses, joint.cameras)
     settings = {
         "job": "calibrate_cameras",
         "models": [model_name(cls) for cls in classes],

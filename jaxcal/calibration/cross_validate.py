@@ -9,7 +9,7 @@ from scipy.special import chdtrc  # scipy.stats says the same, and takes half a 
 from jaxcal.calibration.assemble import split_groups
 from jaxcal.calibration.known import KnownProblem, known_problem, rank_of
 from jaxcal.calibration.lens_basis import to_parameters
-from jaxcal.calibration.model_errors import find_model_errors
+from jaxcal.calibration.model_errors import find_model_errors, with_lag
 from jaxcal.calibration.resolve import recordings_of, resolve
 from jaxcal.calibration.robust import camera_poses
 from jaxcal.calibration.state import RigState, camera_model_of
@@ -62,6 +62,9 @@ def cross_validate(
         progress("cross-validate", splits, splits + 1)
     if not _moving_pictures(known):
         notes.append("frames are too far apart to tell velocities: whether a shutter rolls was not tested")
+    lagging = [camera.name for camera, lags in zip(calibration.cameras, with_lag(calibration), strict=True) if lags]
+    if lagging:
+        notes.append(f"{', '.join(lagging)}: stamps may lag (`stamp_sigma_s`), so no rolling shutter was looked for")
     if known.inflation > 1.0:
         notes.append(
             "errors of views that look alike agree, so that these views count less and sigmas were raised: an error of "

@@ -26,6 +26,7 @@ from jaxcal.calibration.assemble import split_groups
 from jaxcal.calibration.known import KnownProblem
 from jaxcal.calibration.robust import camera_poses
 from jaxcal.cameras import CameraModel
+from jaxcal.results import Calibration
 from jaxcal.results.cross_validation import FALSE_ALARMS, Cause, Evidence
 
 # Distortions beyond a lens model that are usual: along the radius, in these powers of it, and in x and y.
@@ -189,13 +190,21 @@ def _layout(known: KnownProblem) -> tuple[list[Columns], int]:
         if not warp:
             add("bent board", "board", len(_bends(np.zeros((1, 2)))[0]))
         add("misprinted board", "board", 2)
-    for camera in cameras:
-        add("rolling shutter", camera.name, 1)
+    for camera, lags in zip(cameras, with_lag(known.calibration), strict=True):
+        if not lags:
+            add("rolling shutter", camera.name, 1)
     for camera in cameras:
         add("changed lens", camera.name, camera.model.num_parameters)
     for camera in cameras[1:] if known.tied else ():
         add("moved camera", camera.name, 6)
     return columns, start
+
+
+def with_lag(calibration: Calibration) -> list[bool]:
+    """Which cameras' stamps may lag (frames made of events): a lag is not quite the same in all rows, and would be
+    taken for a rolling shutter."""
+    sigmas = calibration.settings.get("stamp_sigma_s") or [0.0] * len(calibration.cameras)
+    return [float(sigma) > 0.0 for sigma in sigmas]
 
 
 def _frames(
@@ -239,8 +248,9 @@ def _frames(
         whole[..., place[None, f"{names[c]} lens"]] = L
         whole[..., place["lens", names[c]]] = _round_directions(from_centre) * root
         whole[..., place["uneven lens", names[c]]] = _image_directions(2.0 * pixels / size - 1.0) * root
-        rows = pixels[:, 1] - 0.5 * size[1]
-        whole[..., place["rolling shutter", names[c]]] = (velocity[f][kept] * rows[:, None])[..., None] * root
+        if ("rolling shutter", names[c]) in place:
+            rows = pixels[:, 1] - 0.5 * size[1]
+            whole[..., place["rolling shutter", names[c]]] = (velocity[f][kept] * rows[:, None])[..., None] * root
         whole[..., place["changed lens", names[c]]] = after * L
         if (None, f"{names[c]} place") in place:
             whole[..., place[None, f"{names[c]} place"]] = by_place

@@ -3,41 +3,77 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 
 from jaxcal.calibration import observability, outliers, uncertainty
-from jaxcal.calibration.assemble import CameraFrames, split_groups
+from jaxcal.calibration.assemble import CameraFrames, split_groups, stack_weights
 from jaxcal.calibration.checks import versions
 from jaxcal.calibration.lens_basis import to_parameters
 from jaxcal.calibration.robust import RobustFit, camera_poses
 from jaxcal.calibration.rolling import check_readout
+from jaxcal.calibration.score_noise import design_effect
 from jaxcal.calibration.state import RigState, SharedLayout, camera_model_of, transform
+from jaxcal.calibration.target_shape import target_points
 from jaxcal.calibration.view_noise import LEAN, share_of_place
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
+from jaxcal.estimation import BlockArrow, solve
 from jaxcal.results import Calibration, CameraCalibration, ImuCalibration, TargetShape
 from jaxcal.targets import Target
 
 
 def chain_covariance_and_sentences(
-    fit: RobustFit, names: Sequence[str], models: Sequence[CameraModel]
+    fit: RobustFit, names: Sequence[str], models: Sequence[CameraModel], cameras: Sequence[CameraFrames]
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Covariance of shared parameters, marginal covariance of the chain, sentences on what is unobserved."""
+    """Covariance of shared parameters, marginal covariance of the chain, sentences on what is unobserved.
+
+    Corners that hang together tell less than least squares took from them: covariances allow for that.
+    """
     labels = uncertainty.labels_of(names, models, fit.problem.layout)
+    effects = _design_effects(fit, cameras)
+    equations = fit.result.equations if max(effects) == 1.0 else _equations_of_less(fit, cameras, effects)
     covariance, chain, sentences = uncertainty.shared_covariance(
-        fit.result.equations, np.asarray(fit.problem.free), labels, to_parameters(fit.problem.basis, fit.problem.layout)
+        equations, np.asarray(fit.problem.free), labels, to_parameters(fit.problem.basis, fit.problem.layout)
     )
-    # Views that repeat each other's errors were given relative weights; what they are worth together is less still.
-    inflation = max(r.inflation for r in fit.redundancy)
-    worst = max(range(len(names)), key=lambda c: fit.redundancy[c].inflation)
-    if inflation > 1.0:
+    for name, redundancy, effect in zip(names, fit.redundancy, effects, strict=True):
+        if effect == 1.0:
+            continue
+        if redundancy.inflation > 1.0:
+            what = (
+                f"the errors of views that look alike agree (correlation {redundancy.correlation:.2f}), so they are no "
+                "noise: the lens model is too lean, the board not flat, or the detector biased. Such views count less"
+            )
+        else:
+            what = "the errors of corners hang together, within a view or from one view to the next"
         sentences.append(
-            f"{names[worst]}: the errors of views that look alike agree (correlation "
-            f"{fit.redundancy[worst].correlation:.2f}), so they are not noise: the lens model is too lean, the board "
-            "not flat, or the detector biased. Such views count less, and all sigmas were raised "
-            f"{np.sqrt(inflation):.1f}-fold."
+            f"{name}: {what}, and sigmas of this camera are {np.sqrt(effect):.1f} times what independent errors of the "
+            "same size would make them."
         )
-    return covariance * inflation, chain * inflation, sentences
+    return covariance, chain, sentences
+
+
+def _design_effects(fit: RobustFit, cameras: Sequence[CameraFrames]) -> list[float]:
+    """By how much the corners of each camera tell less than their weights say."""
+    problem, state, layout = fit.problem, fit.state, fit.problem.layout
+    poses = split_groups(layout, cameras, [np.asarray(part) for part in camera_poses(problem, state)])
+    points = np.asarray(target_points(problem.geometry, state.target))
+    models = [camera_model_of(state, layout, problem.templates, c) for c in range(layout.num_cameras)]
+    parts = zip(models, poses, fit.errors, _corner_weights(fit, cameras), fit.redundancy, strict=True)
+    # Views that repeat each other's errors got relative weights, which claim too much by `inflation` in any case.
+    return [max(design_effect(model, points, *own), known.inflation) for model, *own, known in parts]
+
+
+def _equations_of_less(fit: RobustFit, cameras: Sequence[CameraFrames], effects: Sequence[float]) -> BlockArrow:
+    """The equations at the optimum with each camera's corners counting as much as they tell."""
+    weights = [own / effect for own, effect in zip(_corner_weights(fit, cameras), effects, strict=True)]
+    stacked = stack_weights(fit.problem.layout, cameras, weights)
+    problem = eqx.tree_at(lambda p: [data.weight for data in p.corners], fit.problem, list(stacked))
+    return solve(problem, fit.state, max_steps=1).equations  # those that the first step would solve
+
+
+def _corner_weights(fit: RobustFit, cameras: Sequence[CameraFrames]) -> list[np.ndarray]:
+    return split_groups(fit.problem.layout, cameras, [np.asarray(data.weight) for data in fit.problem.corners])
 
 
 # What to try where a lens is too lean for its corners.

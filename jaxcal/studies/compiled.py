@@ -5,7 +5,8 @@ weight of each view, so that they share shapes and one program, and follow each 
 calibration had rejected stay out; noise and weights are those that it had found.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -17,6 +18,7 @@ from jaxcal.calibration.assemble import stack_groups, stack_weights
 from jaxcal.calibration.known import KnownProblem, known_problem
 from jaxcal.calibration.lens_basis import to_parameters
 from jaxcal.calibration.problem import RigProblem
+from jaxcal.calibration.score_noise import design_effect
 from jaxcal.calibration.state import RigState
 from jaxcal.calibration.uncertainty import named_jacobian
 from jaxcal.estimation import factorise, single_threaded_blas, solve_inside
@@ -38,11 +40,13 @@ class ManyFits:
 
 @dataclass(frozen=True)
 class Batch:
-    """A calibration's problem made ready for many runs."""
+    """A calibration's problem made ready for many runs; `effects` (C,): how much less than their weights say the
+    measured corners of each camera tell."""
 
     known: KnownProblem
     fitted: list[np.ndarray]
     noise_px: list[np.ndarray]
+    effects: list[float]
 
     @property
     def num_views(self) -> int:
@@ -53,8 +57,9 @@ def batch_of(calibration: Calibration) -> Batch:
     """The fit's own corners (F, N, 2) per camera, what the lens and the poses say without noise, and the noise of each
     corner (F, N), px. Raises CalibrationError as `known_problem` does."""
     known = known_problem(calibration)
-    fitted = [frames.pixels + error for frames, error in zip(known.cameras, known.errors(known.state), strict=True)]
-    return Batch(known, fitted, known.noise_px)
+    errors = known.errors(known.state)
+    fitted = [frames.pixels + error for frames, error in zip(known.cameras, errors, strict=True)]
+    return Batch(known, fitted, known.noise_px, _design_effects(known, errors))
 
 
 def run_batch(batch: Batch, pixels: list[list[np.ndarray]] | None, of_view: np.ndarray) -> ManyFits:
@@ -81,7 +86,10 @@ def run_batch(batch: Batch, pixels: list[list[np.ndarray]] | None, of_view: np.n
     )
     with single_threaded_blas():
         states, converged, squares, schur = jax.block_until_ready(_many(known.problem, known.state, *runs))
-    return _judged(batch, states, np.asarray(converged), np.asarray(squares), np.asarray(schur), of_view)
+    fits = _judged(batch, states, np.asarray(converged), np.asarray(squares), np.asarray(schur), of_view)
+    if pixels is not None:
+        return fits  # noise that was made is independent
+    return replace(fits, std=fits.std * np.sqrt(_of_blocks(known, batch.effects)))
 
 
 @eqx.filter_jit
@@ -144,6 +152,29 @@ def _judged(
     variance = np.einsum("np,rpq,nq->rn", jacobian, covariance, jacobian, optimize=True)
     variance *= known.inflation * np.mean(ratio, axis=1)[:, None]
     return ManyFits(states, converged, sigma * np.sqrt(ratio), np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _design_effects(known: KnownProblem, errors: Sequence[np.ndarray]) -> list[float]:
+    """By how much the corners of each camera tell less than their weights and `known.inflation` say."""
+    points, effects = known.calibration.target_points, []
+    for camera, frames, own, weights in zip(
+        known.calibration.cameras, known.cameras, errors, known.weights, strict=True
+    ):
+        assert camera.T_cam_target is not None  # or there would be no known problem
+        effect = design_effect(camera.model, points, camera.T_cam_target[frames.frames], own, weights)
+        effects.append(max(effect / known.inflation, 1.0))
+    return effects
+
+
+def _of_blocks(known: KnownProblem, effects: Sequence[float]) -> np.ndarray:
+    """(n,) the design effect of each parameter: its camera's, or that of the worst where several have part in it."""
+    calibration = known.calibration
+    own = {camera.name: effect for camera, effect in zip(calibration.cameras, effects, strict=True)}
+    factors = [
+        np.full(size, max(effects) if "T_cn" in block else own.get(block.partition(".")[0], max(effects)))
+        for block, size in calibration.blocks
+    ]
+    return np.concatenate(factors)
 
 
 def _named_jacobian(known: KnownProblem) -> np.ndarray:

@@ -77,6 +77,14 @@ def test_cameras_that_see_at_the_same_instants_are_each_halved() -> None:
 
 
 @pytest.mark.slow
+def test_frames_that_may_lag_have_no_shutter_that_could_roll(sound: Calibration) -> None:
+    lagging = dataclasses.replace(sound, settings={**sound.settings, "stamp_sigma_s": [5e-4]})
+    for calibration, looked_for in ((sound, True), (lagging, False)):
+        causes = {evidence.cause for evidence in find_model_errors(known_problem(calibration))}
+        assert ("rolling shutter" in causes) == looked_for
+        assert "lens" in causes
+
+
 @pytest.mark.parametrize(
     ("error", "cause", "cameras"),
     [

@@ -34,7 +34,7 @@ def test_only_offsets_become_less_certain(delays: list[float], to_first_camera: 
 
 def test_one_number_for_all_or_one_each() -> None:
     assert stamp_sigmas_of(1e-3, 3) == [1e-3] * 3
-    assert stamp_sigmas_of([0, 1e-3], 2) == [0.0, 1e-3]
+    assert stamp_sigmas_of([0.0, 1e-3], 2) == [0.0, 1e-3]
     for wrong in ([1e-3], -1.0, [0.0, float("nan")], [0.0, float("inf")]):
         with pytest.raises(CalibrationError, match="expected seconds, zero or more: one number for all 2 cameras or"):
             stamp_sigmas_of(wrong, 2)
