@@ -1,7 +1,9 @@
 """`write_report`: one self-contained HTML page that says whether a calibration is good, and shows why."""
 
+import contextlib
+import gc
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +21,15 @@ from jaxcal.results.projection_uncertainty import can_be_told, projection_uncert
 from jaxcal.results.report.camera_figures import camera_pictures
 from jaxcal.results.report.cross_validation_section import cross_validation_section
 from jaxcal.results.report.drawing import ACCENT, Picture, label, nothing_to_show, panel, to_svg
-from jaxcal.results.report.frames import FramePicture, frame_pictures
+from jaxcal.results.report.frames import frame_pictures
 from jaxcal.results.report.imu_figures import imu_pictures
 from jaxcal.results.report.rig_figures import rig_pictures
 from jaxcal.results.report.rig_scene import rig_scene
 from jaxcal.results.report.tables import camera_tables, check_rows, gravity_table, imu_facts
 from jaxcal.results.report.time_figure import time_picture
 from jaxcal.results.verdict import Verdict, judge
+
+_STAGE = "report"  # of the progress
 
 
 def write_report(
@@ -41,16 +45,40 @@ def write_report(
     reported without pictures of their detections. A `cross_validation` of this calibration gets a section of its own.
     Returns the verdict that the report opens with. Raises CalibrationError when an image has not its camera's size.
     """
-    stage = "report"
+    with _collections_put_off():
+        page, verdict = _page(calibration, images or {}, progress, cross_validation)
+    write_text(Path(path), page)
+    progress(_STAGE, len(calibration.cameras) + 1, len(calibration.cameras) + 1)
+    return verdict
+
+
+@contextlib.contextmanager
+def _collections_put_off() -> Iterator[None]:
+    """No search for garbage meanwhile: figures are circles of thousands of objects, and looking for them over and over,
+    through all that jax holds, takes a fifth of the time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def _page(
+    calibration: Calibration,
+    images: Mapping[str, Frames],
+    progress: Progress,
+    cross_validation: CrossValidation | None,
+) -> tuple[str, Verdict]:
+    """The report's HTML, and the verdict that it opens with."""
     total = len(calibration.cameras) + 1
     cameras = []
-    progress(stage, 0, total)
+    progress(_STAGE, 0, total)
     told = [camera for camera in calibration.cameras if can_be_told(calibration, camera)]
     projections = {camera.name: projection_uncertainty(calibration, camera.name) for camera in told}
     for index, camera in enumerate(calibration.cameras):
-        frames: list[FramePicture] = []
-        if images is not None and camera.name in images:
-            frames = frame_pictures(camera, images[camera.name])
+        frames = frame_pictures(camera, images[camera.name]) if camera.name in images else []
         cameras.append(
             {
                 "id": f"camera-{index}",
@@ -59,13 +87,10 @@ def write_report(
                 "pictures": camera_pictures(camera, calibration.target, projections.get(camera.name), f"c{index}"),
             }
         )
-        progress(stage, index + 1, total)
+        progress(_STAGE, index + 1, total)
     cross = None if cross_validation is None else cross_validation_section(cross_validation)
     verdict = judge(calibration, projections)
-    page = _template().render(**_content(calibration, verdict), cameras=cameras, cross=cross)
-    write_text(Path(path), page)
-    progress(stage, total, total)
-    return verdict
+    return _template().render(**_content(calibration, verdict), cameras=cameras, cross=cross), verdict
 
 
 def _content(calibration: Calibration, verdict: Verdict) -> dict[str, Any]:
