@@ -43,6 +43,11 @@ def design_effect(
         for some in np.array_split(taken, -(-len(taken) // _AT_ONCE))
     ]
     scores, of_views = (np.concatenate(part) for part in zip(*parts, strict=True))
+    # Steps may leave the lens' domain where a corner lies on its border.
+    fine = np.isfinite(scores).all(axis=1) & np.isfinite(of_views).all(axis=(1, 2))
+    if fine.sum() < _FEWEST_VIEWS:
+        return 1.0
+    scores, of_views = scores[fine], of_views[fine]
     information = of_views.sum(axis=0)
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))

@@ -81,6 +81,19 @@ def test_corners_that_take_no_part_are_not_asked() -> None:
     assert effect(np.where(out[..., None], np.nan, errors), T, of_corners) == 1.0
 
 
+def test_views_without_derivatives_are_left_out() -> None:
+    rng = np.random.default_rng(5)
+    T = poses(rng)
+    errors = NOISE_PX * rng.standard_normal((VIEWS, len(POINTS), 2))
+    lasting = errors[0] + 0.0 * errors
+    whole = effect(lasting[1:], T[1:])
+    T[0, 0, 3] = np.nan
+    assert effect(lasting, T) == pytest.approx(whole, rel=0.1)
+    assert whole > 1.5
+    T[:, 0, 3] = np.nan
+    assert effect(lasting, T) == 1.0
+
+
 def test_too_few_views_say_nothing() -> None:
     rng = np.random.default_rng(4)
     T = poses(rng, 7)
