@@ -59,7 +59,10 @@ def main() -> int:
 def run(kind: str, code: str, folder: Path) -> str:
     """What a block prints, with the places of this machine left out. Raises RuntimeError when it fails."""
     command = ["bash", "-eo", "pipefail", "-c", code] if kind == "bash" else [sys.executable, "-c", code]
-    environment = os.environ | {"JAXCAL_DATA": str(Path(os.environ["JAXCAL_DATA"]).resolve())}
+    environment = os.environ | {
+        "JAXCAL_DATA": str(Path(os.environ["JAXCAL_DATA"]).resolve()),
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",  # this environment's jaxcal
+    }
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     if done.returncode not in _ACCEPTED:
         raise RuntimeError(f"exit status {done.returncode} of\n{code}\n{done.stdout}{done.stderr}")
