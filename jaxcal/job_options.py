@@ -77,6 +77,10 @@ def _value(value: Any, kind: Any, where: str, folder: Path, target: Target) -> A
     simple = {bool: as_bool, int: _as_whole, float: _as_number}
     if len(kinds) == 1 and kinds[0] in simple:
         return simple[kinds[0]](value, where)
+    if float in kinds:  # one number for all cameras, or one each
+        if isinstance(value, list):
+            return [_as_number(one, f"{where}[{i}]") for i, one in enumerate(value)]
+        return _as_number(value, where)
     return value  # of several kinds: the job itself says what it expects
 
 

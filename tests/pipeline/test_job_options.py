@@ -41,6 +41,8 @@ def test_all_that_python_can_say_can_be_said(job: Any) -> None:
         (calibrate_cameras, {"spline_order": 6}, "'spline_order' is for cameras with an IMU"),
         (calibrate_camera_imu, {"views": 20}, "'views' is for cameras without an IMU"),
         (calibrate_camera_imu, {"knot_rate_hz": ".inf"}, "calibration.knot_rate_hz: expected a number"),
+        (calibrate_camera_imu, {"stamp_sigma_s": "late"}, "calibration.stamp_sigma_s: expected a number, found 'late'"),
+        (calibrate_camera_imu, {"stamp_sigma_s": [0, None]}, r"stamp_sigma_s\[1\]: expected a number, found None"),
         (calibrate_camera_imu, {"imu_noise": "estimate"}, "Did you mean 'estimated'"),
         (calibrate_camera_imu, {"rolling_shutter": True}, "'rolling_shutter' is not said here, but by"),
         (calibrate_camera_imu, {"models": ["ds-none"]}, "'models' is not said here, but by 'model' of each camera"),
@@ -54,6 +56,8 @@ def test_mistakes_are_named(job: Any, content: Any, message: str) -> None:
 
 def test_numbers_that_yaml_reads_as_text() -> None:
     assert options(calibrate_cameras, yaml.safe_load("{point_offset_sigma_m: 1e-4}")) == {"point_offset_sigma_m": 1e-4}
+    assert options(calibrate_cameras, yaml.safe_load("{stamp_sigma_s: 5e-4}")) == {"stamp_sigma_s": 5e-4}
+    assert options(calibrate_cameras, yaml.safe_load("{stamp_sigma_s: [0, 5e-4]}")) == {"stamp_sigma_s": [0.0, 5e-4]}
 
 
 def test_an_earlier_calibration_is_read_from_a_camchain(tmp_path: Path) -> None:
