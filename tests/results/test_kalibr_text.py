@@ -110,7 +110,7 @@ def test_the_command_writes_the_text_too(made: Calibration, tmp_path: Path) -> N
     command = ["convert", "calibration", str(tmp_path / "ours"), str(tmp_path / "theirs"), "--format", "kalibr"]
     assert CliRunner().invoke(main, command, catch_exceptions=False).exit_code == 0
     names = sorted(path.name for path in (tmp_path / "theirs").iterdir())
-    assert names == ["camchain-imucam.yaml", "imu.yaml", "results-imucam.txt"]
+    assert names == ["camchain-imucam.yaml", "imu.yaml", "imu0.yaml", "results-imucam.txt"]
 
 
 def test_other_texts_are_refused(made: Calibration, tmp_path: Path) -> None:
