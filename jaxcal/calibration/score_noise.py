@@ -105,5 +105,5 @@ def _derivatives(model: CameraModel, seen: np.ndarray) -> tuple[np.ndarray, np.n
     def slope(value: Callable[[int, float], np.ndarray], k: int, step: float) -> np.ndarray:
         return (value(k, step) - value(k, -step)) / (2.0 * step)
 
-    by_lens = [slope(of_lens, k, _STEP * max(1.0, abs(parameters[k]))) for k in chosen]
+    by_lens = [slope(of_lens, k, _STEP * max(1.0, float(abs(parameters[k])))) for k in chosen]
     return np.stack(by_lens, axis=-1), np.stack([slope(of_pose, k, _STEP) for k in range(6)], axis=-1)
