@@ -11,7 +11,10 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import ScaledTranslation
 from PIL import Image
+
+from jaxcal.results.report.ticks import draw_ticks
 
 # Colours that stand for a CSS variable of the page and are exchanged for it in the SVG, so that one figure serves the
 # light and the dark page. Raster parts cannot do this: they use the fixed colours below, readable on either.
@@ -34,6 +37,7 @@ REJECTED = "#e2574c"
 
 PANEL = (4.4, 3.3)  # inches; three abreast on a desk, one on a phone
 _FONT_SIZE = 9.0
+_LABEL_BELOW = 0.235  # inches from the axes to the name of x
 _TICKS = 4  # intervals along an axis, at most
 _SETTINGS_LOCK = threading.Lock()  # matplotlib's SVG writer reads process-wide settings
 _RASTER_DPI = 150
@@ -60,6 +64,9 @@ def panel(rows: int = 1, size: tuple[float, float] = PANEL) -> tuple[Figure, Seq
     for axes in grid:
         _dress(axes)
         axes.yaxis.set_label_coords(-0.19, 0.5)
+        axes.xaxis.set_label_coords(
+            0.5, 0.0, axes.transAxes + ScaledTranslation(0.0, -_LABEL_BELOW, figure.dpi_scale_trans)
+        )
     return figure, list(grid)
 
 
@@ -129,6 +136,7 @@ def normal_density(x: np.ndarray) -> np.ndarray:
 def to_svg(figure: Figure, prefix: str) -> str:
     """The figure as an `<svg>` element that scales with the page; `prefix` keeps its ids apart from other figures'."""
     buffer = io.StringIO()
+    draw_ticks(figure, MUTED, LINE, _FONT_SIZE - 1.0)
     # Text stays text (smaller, selectable); the salt makes ids, and so the page, the same in every run.
     with _SETTINGS_LOCK, mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "jaxcal"}):
         figure.savefig(buffer, format="svg", transparent=True, dpi=_RASTER_DPI)
@@ -162,8 +170,6 @@ def _dress(axes: Axes) -> None:
         spine.set_color(LINE)
         spine.set_linewidth(0.8)
         spine.set_visible(side in ("left", "bottom"))
-    axes.tick_params(which="both", colors=MUTED, labelcolor=MUTED, labelsize=_FONT_SIZE - 1.0, length=3.0, width=0.8)
-    # Ticks are most of the work of drawing a small figure.
     axes.locator_params(nbins=_TICKS)
-    axes.grid(visible=True, color=LINE, linewidth=0.6, alpha=0.6)
+    axes.grid(visible=True)
     axes.set_axisbelow(True)

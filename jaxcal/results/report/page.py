@@ -55,7 +55,7 @@ def write_report(
 @contextlib.contextmanager
 def _collections_put_off() -> Iterator[None]:
     """No search for garbage meanwhile: figures are circles of thousands of objects, and looking for them over and over,
-    through all that jax holds, takes time (0.5 of 9 s with eight cameras)."""
+    through all that jax holds, takes time (0.5 s with eight cameras)."""
     enabled = gc.isenabled()
     gc.disable()
     try:
