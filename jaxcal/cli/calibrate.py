@@ -12,6 +12,7 @@ from jaxcal.cli.outcome import EXIT_CODES, RERUN_FILE
 @click.argument("rig", metavar="RIG.yaml", type=click.Path(dir_okay=False, path_type=Path))
 @click.option(
     "--output",
+    "-o",
     "--out",
     default=Path("out"),
     show_default=True,

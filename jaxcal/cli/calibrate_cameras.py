@@ -58,6 +58,7 @@ _NOT_NEEDED = all_of(
 @click.option(
     "--out",
     "--output",
+    "-o",
     type=click.Path(file_okay=False, path_type=Path),
     help="Folder for the results (with --bag: BAG-jaxcal).",
 )

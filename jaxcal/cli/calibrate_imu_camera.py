@@ -67,7 +67,11 @@ _NOT_NEEDED = all_of(
 @click.option("--export-poses", is_flag=True, help="Write the motion of the IMU as a csv.")
 @click.option("--workers", type=int, help="Processes for detection (one per core).")
 @click.option(
-    "--out", "--output", type=click.Path(file_okay=False, path_type=Path), help="Folder for the results (BAG-jaxcal)."
+    "--out",
+    "--output",
+    "-o",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder for the results (BAG-jaxcal).",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 @VERBOSE

@@ -19,6 +19,7 @@ def convert() -> None:
 @click.option(
     "--out",
     "--output",
+    "-o",
     type=click.Path(dir_okay=False, path_type=Path),
     help="Camchain to write; without it, only the residuals.",
 )

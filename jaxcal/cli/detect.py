@@ -19,7 +19,12 @@ if TYPE_CHECKING:
     "--target", "target_file", required=True, type=click.Path(dir_okay=False, path_type=Path), help="target.yaml"
 )
 @click.option(
-    "--out", "--output", required=True, type=click.Path(dir_okay=False, path_type=Path), help="File to write, .npz."
+    "--out",
+    "--output",
+    "-o",
+    required=True,
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="File to write, .npz.",
 )
 @click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Draw it: out.png, .svg or .pdf.")
 @click.option("--from-to", nargs=2, type=float, metavar="START END", help="Use this part only; s after the start.")

@@ -14,7 +14,9 @@ _PICTURES = (".png", ".svg", ".pdf")
 
 @click.command("imu-noise")
 @click.argument("still")
-@click.option("--out", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Kalibr's imu.yaml to write.")
+@click.option(
+    "--out", "--output", "-o", type=click.Path(dir_okay=False, path_type=Path), help="Kalibr's imu.yaml to write."
+)
 @click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Draw it: allan.png, .svg or .pdf.")
 @click.option(
     "--inflate",

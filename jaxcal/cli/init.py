@@ -18,7 +18,11 @@ _FILL_IN = "FILL IN"
 @click.option("--imu", type=click.Path(dir_okay=False, path_type=Path), help="imu.yaml with the IMU's noise.")
 @click.option("--model", default="pinhole-radtan", show_default=True, help="Lens model of the cameras.")
 @click.option(
-    "--out", "--output", type=click.Path(dir_okay=False, path_type=Path), help="File to write (rig.yaml in the folder)."
+    "--out",
+    "--output",
+    "-o",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="File to write (rig.yaml in the folder).",
 )
 @click.option("--force", is_flag=True, help="Replace the file where it is there already.")
 def init(recording: Path, target: Path | None, imu: Path | None, model: str, out: Path | None, force: bool) -> None:

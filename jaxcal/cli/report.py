@@ -17,7 +17,11 @@ from jaxcal.cli.outcome import RERUN_FILE
     help="Pictures of a camera, to show its corners on: cam0=left/; may be repeated.",
 )
 @click.option(
-    "--out", "--output", type=click.Path(dir_okay=False, path_type=Path), help="File to write (RESULT/report.html)."
+    "--out",
+    "--output",
+    "-o",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="File to write (RESULT/report.html).",
 )
 @click.option("--rerun", type=RERUN_FILE, help="Write a log for the Rerun viewer, too: out.rrd (jaxcal[rerun]).")
 def report(result: Path, sources: tuple[str, ...], out: Path | None, rerun: Path | None) -> None:

@@ -9,7 +9,11 @@ import click
 @click.command()
 @click.argument("study_file", metavar="STUDY.YAML", type=click.Path(dir_okay=False, path_type=Path))
 @click.option(
-    "--out", "--output", type=click.Path(file_okay=False, path_type=Path), help="Folder for rows, tables and figure."
+    "--out",
+    "--output",
+    "-o",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder for rows, tables and figure.",
 )
 @click.option("--workers", type=click.IntRange(min=1), help="Processes or threads on this machine (one per core).")
 @click.option("--scheduler", metavar="tcp://HOST:PORT", help="Run on the Dask cluster of this scheduler instead.")

@@ -44,6 +44,7 @@ _ONLY = {
 @click.option(
     "--out",
     "--output",
+    "-o",
     "outputs",
     required=True,
     multiple=True,

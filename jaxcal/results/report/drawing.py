@@ -40,7 +40,7 @@ _FONT_SIZE = 9.0
 _LABEL_BELOW = 0.235  # inches from the axes to the name of x
 _TICKS = 4  # intervals along an axis, at most
 _SETTINGS_LOCK = threading.Lock()  # matplotlib's SVG writer reads process-wide settings
-_RASTER_DPI = 150
+_RASTER_DPI = 110
 _RASTER_COLOURS = 48  # dots of two colours and their blends: a palette is a quarter of the bytes
 
 
