@@ -10,7 +10,7 @@ from jaxcal.calibration.assemble import CameraFrames, camera_frames
 from jaxcal.calibration.board_checks import check_board
 from jaxcal.calibration.board_turns import symmetry_sentences, unify_turns
 from jaxcal.calibration.checks import resolve_models, resolve_names
-from jaxcal.calibration.initial_lens import board_poses, initial_lens
+from jaxcal.calibration.initial_lens import board_poses, initial_lens_and_rivals
 from jaxcal.calibration.outcome import calibration_from, chain_covariance_and_sentences
 from jaxcal.calibration.poses import Poses
 from jaxcal.calibration.problem import RigProblem
@@ -99,7 +99,7 @@ def calibrate_cameras(
         max_steps=max_steps,
         progress=progress,
     )
-    fit, restart = confirm_optimum(fit, joint.cameras, max_steps=max_steps)
+    fit, restart = confirm_optimum(fit, joint.cameras, look.rivals, max_steps=max_steps)
     covariance, _, sentences = chain_covariance_and_sentences(fit, names, look.lenses, joint.cameras)
     settings = {
         "job": "calibrate_cameras",
@@ -142,9 +142,11 @@ def _check_options(target: Target, time_offsets: bool, views: int | None, loss: 
 
 @dataclass(frozen=True)
 class _Look:
-    """Each camera by itself: first lens, board poses T_cam_board with their errors, px; and sentences."""
+    """Each camera by itself: first lens and its rivals, board poses T_cam_board with their errors, px; and
+    sentences."""
 
     lenses: list[CameraModel]
+    rivals: list[tuple[CameraModel, ...]]
     cameras: list[CameraFrames]
     boards: list[BoardFrames]
     poses: list[Poses]
@@ -183,10 +185,13 @@ def _first_look(
     sentences = [s for name, frames in zip(names, cameras, strict=True) for s in check_board(name, frames, target)]
     boards = [split_boards(frames, target) for frames in cameras]
     work = list(zip(names, classes, boards, strict=True))
-    lenses = [initial_lens(n, m, b.frames, target) for n, m, b in track(work, "initial lenses", len(work), progress)]
+    tracked = track(work, "initial lenses", len(work), progress)
+    firsts = [initial_lens_and_rivals(n, m, b.frames, target) for n, m, b in tracked]
+    lenses = [first.lens for first in firsts]
     found = [board_poses(lens, b.frames, target) for lens, b in zip(lenses, boards, strict=True)]
     poses = [(rotation, translation) for rotation, translation, _ in found]
-    return _Look(lenses, list(cameras), boards, poses, [error for *_, error in found], sentences)
+    rivals = [first.rivals for first in firsts]
+    return _Look(lenses, rivals, list(cameras), boards, poses, [error for *_, error in found], sentences)
 
 
 def _continuous(names: Sequence[str], look: _Look, target: Target, shape: _Shape) -> _Joint:

@@ -41,6 +41,9 @@ _START_SPREAD = 0.3
 _HELD = 1e18
 # Focal lengths tried for the requested model, relative to the one found.
 _FOCAL_FACTORS = (0.6, 1.7)
+# Fits of the requested model whose cost is not higher than so many times the best are its rivals (wrong corners make up
+# most of the cost); parameters that differ by less, of themselves or absolutely, are one lens.
+_RIVAL_COST, _SAME_LENS = 1.02, 1e-3
 # The share of the corners that the requested model may lose against the generic lens.
 _LOST = 0.005
 # A view whose median error is this many times that of most views may stand in a wrong pose.
@@ -62,8 +65,22 @@ class _Found:
     cost: float
 
 
+@dataclasses.dataclass(frozen=True)
+class FirstLens:
+    """The best lens found, and `rivals`: others of its kind that explain the corners nearly as well, so that only the
+    joint optimisation can tell which is better."""
+
+    lens: CameraModel
+    rivals: tuple[CameraModel, ...] = ()
+
+
 def initial_lens(name: str, model: type[CameraModel], frames: CameraFrames, target: Target) -> CameraModel:
-    """The best lens of the requested kind that a search without a guess finds.
+    """The best lens of the requested kind that a search without a guess finds; raises as `initial_lens_and_rivals`."""
+    return initial_lens_and_rivals(name, model, frames, target).lens
+
+
+def initial_lens_and_rivals(name: str, model: type[CameraModel], frames: CameraFrames, target: Target) -> FirstLens:
+    """The best lens of the requested kind that a search without a guess finds, and its rivals.
 
     Raises CalibrationError when no lens explains the views, or when the requested model is far from holding the lens
     that does.
@@ -81,7 +98,7 @@ def initial_lens(name: str, model: type[CameraModel], frames: CameraFrames, targ
                 f"{best.rms_px:.1f} px (root mean square) in {best.good.sum()} views. Check the target's size, layout "
                 "and orientation, and that the corners' indices are those of this target."
             )
-        lens, rms_px = _requested(model, candidates, views, size)
+        first, rms_px = _requested(model, candidates, views, size)
     if rms_px > max(0.004 * max(size), 8.0 * best.rms_px):
         seen = generic_lens.half_field_of_view(
             best.fit.parameters[0], views.pixels[best.good][views.weight[best.good] > 0]
@@ -91,7 +108,7 @@ def initial_lens(name: str, model: type[CameraModel], frames: CameraFrames, targ
             f"{rms_px:.1f} px (root mean square), where a generic lens misses them by {best.rms_px:.2f} px. The "
             f"corners reach {seen:.0f} degrees from the axis: a field of view of {2 * seen:.0f}. {_advice(seen)}"
         )
-    return lens
+    return first
 
 
 def initial_lenses(
@@ -328,10 +345,12 @@ def _trimmed_rms(lens: Lens, fit: Fit, views: Views, far: float) -> float:
 
 def _requested(
     model: type[CameraModel], candidates: Sequence[_Found], views: Views, size: tuple[int, int]
-) -> tuple[CameraModel, float]:
-    """The requested model fitted to the generic lens' views, from several starts while it is worse than that lens."""
+) -> tuple[FirstLens, float]:
+    """The requested model fitted to the generic lens' views, from several starts while it is worse than that lens, with
+    its rivals and its error, px."""
     far = float(max(size))
     best: tuple[Fit, Views, CameraModel] | None = None
+    met: list[Fit] = []
     for found in candidates:
         kept = views.with_weight(views.weight * found.good[:, None])
         for starts in _starts(model, found, kept, size):
@@ -339,12 +358,24 @@ def _requested(
             for start in starts:
                 fit = _fit_model(start, found.fit, kept, far)
                 logger.debug("%s: cost %.6g, %s", model.name, fit.cost[0], fit.parameters[0])
+                met.append(fit)
                 if best is None or fit.cost[0] < best[0].cost[0]:
                     best = (fit, kept, start)
             if best is not None and _as_good(*best, found, far):
-                return _sharpened(*best, far)
+                return _with_rivals(*best, met, far)
     assert best is not None
-    return _sharpened(*best, far)
+    return _with_rivals(*best, met, far)
+
+
+def _with_rivals(fit: Fit, views: Views, start: CameraModel, met: Sequence[Fit], far: float) -> tuple[FirstLens, float]:
+    """The fit, sharpened, and those of the others met that cost hardly more; with the error, px."""
+    lens, rms_px = _sharpened(fit, views, start, far)
+    different = [fit.parameters[0]]
+    for other in sorted(met, key=lambda f: float(f.cost[0])):
+        same = [np.allclose(other.parameters[0], p, rtol=_SAME_LENS, atol=_SAME_LENS) for p in different]
+        if other.cost[0] < _RIVAL_COST * fit.cost[0] and not any(same):
+            different.append(other.parameters[0])
+    return FirstLens(lens, tuple(start.with_parameters(p) for p in different[1:])), rms_px
 
 
 def _starts(

@@ -15,6 +15,7 @@ from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.robust import RobustFit, corner_errors
 from jaxcal.calibration.state import RigState, SharedLayout
 from jaxcal.calibration.uncertainty import shared_information
+from jaxcal.cameras import CameraModel
 from jaxcal.estimation import BlockArrow, SolveResult, on_device, solve
 
 logger = logging.getLogger(__name__)
@@ -45,21 +46,31 @@ _AMBIGUOUS = (
 )
 # How firmly a lens is held on the way, beside what the corners say of it.
 _HOLD = 1e4
+# And how far parameters that nearly cancel may be from zero on the way, in terms of their usual spread.
+_PLAIN = 0.3
 # So far may the cost at the restart exceed what the quadratic model promises; beyond, the start is nonsense (a lens
 # with a pole in the image, say) and moves nearer.
 _BELIEVABLE = 3.0
 _HALVINGS = 6
 
 
-def confirm_optimum(fit: RobustFit, cameras: Sequence[CameraFrames], *, max_steps: int) -> tuple[RobustFit, list[str]]:
+def confirm_optimum(
+    fit: RobustFit,
+    cameras: Sequence[CameraFrames],
+    rivals: Sequence[Sequence[CameraModel]] = (),
+    *,
+    max_steps: int,
+) -> tuple[RobustFit, list[str]]:
     """Solve again from ten sigmas away; a lower optimum found on the way is taken, and tried in turn.
 
-    Where the first restart comes back, that is all. Where not, or where the cost is far from quadratic between, more
-    follow, near and far, and walks along the lenses' weakest directions. Returns the fit to use, and a sentence where
-    restarts do not agree, or where another optimum is as good. Deterministic.
+    Before that from each camera's `rivals`, lenses that looked nearly as good at first. Where the first restart comes
+    back, that is all. Where not, or where the cost is far from quadratic between, more follow, near and far, and walks
+    along the lenses' weakest directions. Returns the fit to use, and a sentence where restarts do not agree, or where
+    another optimum is as good. Deterministic.
     """
     rng = np.random.default_rng(0)
     agreed, bent, worse = 0, False, None
+    fit, ambiguous = _best_of_rivals(fit, rivals, max_steps)
     for attempt in range(_MOST_RESTARTS):
         sigmas = _RESTART_SIGMAS if attempt == 0 else _MORE_SIGMAS[attempt % len(_MORE_SIGMAS)]
         step = _displacement(fit, sigmas, rng)
@@ -79,10 +90,10 @@ def confirm_optimum(fit: RobustFit, cameras: Sequence[CameraFrames], *, max_step
         bent = bent or halved
         if agreed >= (_ENOUGH_BENT if bent else _ENOUGH):
             break
-    sentences = []
+    sentences = [_AMBIGUOUS] if ambiguous else []
     for walk in range(_MOST_WALKS if bent else 0):
         lower, rivalled = _along_the_valley(fit, max_steps)
-        sentences = [_AMBIGUOUS] if rivalled else []
+        sentences = [_AMBIGUOUS] if ambiguous or rivalled else []
         if lower is None:
             break
         logger.info(
@@ -96,21 +107,96 @@ def confirm_optimum(fit: RobustFit, cameras: Sequence[CameraFrames], *, max_step
     return fit, [_uncertain(float(fit.result.equations.cost), worse), *sentences]
 
 
+def _best_of_rivals(fit: RobustFit, rivals: Sequence[Sequence[CameraModel]], max_steps: int) -> tuple[RobustFit, bool]:
+    """The lowest of the fit and the optima reached from each camera's rivals, and whether another is as good."""
+    layout = fit.problem.layout
+    lenses = [(camera, model) for camera, models in enumerate(rivals) for model in models]
+    reached = [_from_rival(fit, *pair, max_steps) for pair in lenses]
+    cancelling = [c for c in range(layout.num_cameras) if fit.problem.templates[layout.place(c)[0]].usual_spread]
+    reached = [r for r in [*reached, *(_from_plain(fit, c, max_steps) for c in cancelling)] if r is not None]
+    if not reached:
+        return fit, False
+    lowest = min([fit.result, *reached], key=lambda result: float(result.equations.cost))
+    before, after = float(fit.result.equations.cost), float(lowest.equations.cost)
+    logger.info("rivals: cost %.9g, from %.9g", after, before)
+    best = fit if after >= before * (1.0 - _SAME_COST) else dataclasses.replace(fit, result=lowest)
+    others = [result for result in [fit.result, *reached] if result is not best.result]
+    cameras = {camera for camera, _ in lenses}
+    return best, any(_is_rival(best, other, camera) for other in others for camera in cameras)
+
+
+def _from_rival(fit: RobustFit, camera: int, lens: CameraModel, max_steps: int) -> SolveResult | None:
+    """Where the optimisation ends from another lens of a camera, to which all else is adapted first; None where lenses
+    are held in part, or the end is no optimum."""
+    covariance = _lens_covariance(fit, camera)
+    if covariance is None or fit.problem.basis[fit.problem.layout.place(camera)[0]] is not None:
+        return None
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    hold = np.where(sigma > 0, _HOLD / np.where(sigma > 0, sigma, 1.0) ** 2, 0.0)
+    return _by_way_of(fit, camera, np.asarray(lens.parameters), hold, max_steps)
+
+
+def _from_plain(fit: RobustFit, camera: int, max_steps: int) -> SolveResult | None:
+    """Where the optimisation ends from a lens whose parameters of `usual_spread` are zero, and may spread but little at
+    first: where they nearly cancel, a lens can end behind a pole of its denominator."""
+    group, place = fit.problem.layout.place(camera)
+    template, parameters = fit.problem.templates[group], np.array(fit.state.lenses[group])[place]
+    hold = np.zeros(len(parameters))
+    for index, name in enumerate(name for part in template.parameter_names for name in part):
+        if name in template.usual_spread:
+            parameters[index], hold[index] = 0.0, (_PLAIN * template.usual_spread[name]) ** -2
+    return _by_way_of(fit, camera, parameters, hold, max_steps)
+
+
+def _by_way_of(
+    fit: RobustFit, camera: int, parameters: np.ndarray, hold: np.ndarray, max_steps: int
+) -> SolveResult | None:
+    """Where the optimisation ends from a lens (n,), to which all else is adapted first while information (n,) holds it;
+    None where that end is no optimum."""
+    group, place = fit.problem.layout.place(camera)
+    lenses = list(fit.state.lenses)
+    lenses[group] = lenses[group].at[place].set(on_device(parameters))
+    start = eqx.tree_at(lambda s: s.lenses, fit.state, tuple(lenses))
+    held = _with_prior(fit.problem, camera, parameters, np.diag(hold))
+    adapted = solve(held, start, max_steps=max_steps, rtol=_ENOUGH_TO_WALK)
+    result = solve(fit.problem, adapted.state, max_steps=max_steps)
+    settled = bool(result.converged) and np.isfinite(float(result.equations.cost))
+    return result if settled else None
+
+
+def _is_rival(best: RobustFit, other: SolveResult, camera: int) -> bool:
+    """Whether another optimum is as good as the best, and its lens another one."""
+    covariance = _lens_covariance(best, camera)
+    functional = None if covariance is None else _weakest(covariance)
+    if functional is None:
+        return False
+    layout = best.problem.layout
+    away = functional @ (_lens(layout, other.state, camera) - _lens(layout, best.state, camera))
+    above = float(other.equations.cost) - float(best.result.equations.cost)
+    return bool(abs(away) > _RIVAL_SIGMAS and abs(above) < _AS_GOOD)
+
+
+def _lens_covariance(fit: RobustFit, camera: int) -> np.ndarray | None:
+    """The covariance (n, n) of a camera's lens; None where directions are not determined."""
+    free = np.asarray(fit.problem.free)
+    values, directions = shared_information(fit.result.equations, free)
+    if not len(values) or values.min() <= 0:
+        return None
+    covariance = np.zeros((len(free), len(free)))
+    covariance[np.ix_(free, free)] = (directions / values) @ directions.T
+    own = fit.problem.layout.lens(camera)
+    return covariance[own, own]
+
+
 def _along_the_valley(fit: RobustFit, max_steps: int) -> tuple[SolveResult | None, bool]:
     """The lowest optimum met from points of the lenses' weakest directions, None where none is below the fit's own; and
     whether another optimum is as good."""
     problem, layout = fit.problem, fit.problem.layout
-    free = np.asarray(problem.free)
-    values, directions = shared_information(fit.result.equations, free)
-    if not len(values) or values.min() <= 0:
-        return None, False
-    covariance = np.zeros((len(free), len(free)))
-    covariance[np.ix_(free, free)] = (directions / values) @ directions.T
     best, own_cost, rivalled = None, float(fit.result.equations.cost), False
     lowest = own_cost
     for camera in range(layout.num_cameras):
-        own = layout.lens(camera)
-        functional = _weakest(covariance[own, own])
+        covariance = _lens_covariance(fit, camera)
+        functional = None if covariance is None else _weakest(covariance)
         # Lenses whose parameters nearly cancel have valleys without an end, and a prior that says where to stay.
         if functional is None or problem.basis[layout.place(camera)[0]] is not None:
             continue
@@ -163,9 +249,15 @@ def _held_at(problem: RigProblem, state: RigState, camera: int, functional: np.n
     # The sum of both quadratics is one about this mean (least squares: the information may be singular).
     wanted = information @ mean + _HOLD * functional * (functional @ now + value)
     middle = np.linalg.lstsq(information + hold, wanted, rcond=None)[0]
+    return _with_prior(problem, camera, middle, information + hold)
+
+
+def _with_prior(problem: RigProblem, camera: int, mean: np.ndarray, information: np.ndarray) -> RigProblem:
+    """The problem with another prior (n,), (n, n) of one lens; no program is compiled anew for it."""
+    group, place = problem.layout.place(camera)
     means, informations = list(problem.prior.mean), list(problem.prior.information)
-    means[group] = means[group].at[place].set(on_device(middle))
-    informations[group] = informations[group].at[place].set(on_device(information + hold))
+    means[group] = means[group].at[place].set(on_device(mean))
+    informations[group] = informations[group].at[place].set(on_device(information))
     return eqx.tree_at(lambda p: p.prior, problem, LensPrior(tuple(means), tuple(informations)))
 
 

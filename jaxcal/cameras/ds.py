@@ -62,7 +62,8 @@ class DoubleSphere(CameraModel):
 
     @classmethod
     def starts(cls, focal: float, image_size: tuple[int, int]) -> tuple["CameraModel", ...]:
-        """A stereographic lens, a weaker barrel, and the middle of the lenses in the paper's table 2."""
+        """A stereographic lens, a weaker barrel, the middle of the lenses in the paper's table 2, and its
+        opposite: most lenses have two optima, on either side of xi = 0."""
         first = cls.from_focal(focal, image_size)
         return tuple(
             eqx.tree_at(
@@ -70,5 +71,5 @@ class DoubleSphere(CameraModel):
                 first,
                 (jnp.asarray(xi), jnp.asarray(alpha), jnp.full(2, focal * (1.0 + xi))),
             )
-            for xi, alpha in ((0.0, 0.5), (0.0, 0.2), (-0.2, 0.6))
+            for xi, alpha in ((0.0, 0.5), (0.0, 0.2), (-0.2, 0.6), (0.25, 0.6))
         )
