@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from jaxcal.calibration import calibrate_camera_imu, calibrate_cameras, cross_validate
+from jaxcal.calibration import calibrate_camera_imu, calibrate_cameras, cross_validate, frame_rate_for_spline
 from jaxcal.cameras import camera_model
 from jaxcal.detection import detect
 from jaxcal.event_frames import LAG_SIGMA_S, frames_key, write_event_frames
@@ -17,7 +17,7 @@ from jaxcal.observations import Detections, Frames, ImuRecording
 from jaxcal.progress import Progress, no_progress
 from jaxcal.recording import EventFile, Rig, RigCamera, load_frames, load_rig
 from jaxcal.recording.cut import cut_detections, cut_frames
-from jaxcal.recording.windows import WindowPlan
+from jaxcal.recording.windows import BY_SPLINE, WindowPlan
 from jaxcal.recording.yaml_files import located
 from jaxcal.results import Calibration, save_cross_validation
 from jaxcal.results.report import write_report
@@ -188,6 +188,8 @@ def _from_events(
         source = next(iter(recorded))
         times = replace(times, window_ms=None, stamps_of=source)
     times = times.or_windows_of(settings.window_ms)
+    if times.rate_hz == BY_SPLINE:
+        times = replace(times, rate_hz=_rate_for_spline(rig, settings))
     stamps = None if source is None else recorded[source].timestamps_ns
     made = {}
     for camera in rig.cameras:
@@ -197,6 +199,13 @@ def _from_events(
         plan = times.plan(events, stamps, span_ns)
         made[camera.name] = _reconstructed(rig, camera, events, plan, network, settings, cache, progress)
     return made
+
+
+def _rate_for_spline(rig: Rig, settings: PipelineSettings) -> float:
+    """Frames per second for the spline on which this rig will be calibrated."""
+    names = {"spline_order": "order", "knot_rate_hz": "knot_rate_hz"}
+    given = {names[key]: value for key, value in _options(rig, settings).items() if key in names}
+    return frame_rate_for_spline(rig.imus[0].load(), **given)
 
 
 def _reconstructed(

@@ -56,7 +56,7 @@ def calibrate_camera_imu(
     board_warp: bool = False,
     point_offset_sigma_m: float | None = None,
     loss: Loss = "huber",
-    spline_order: int = 6,
+    spline_order: int = spline_setup.SPLINE_ORDER,
     knot_rate_hz: float | None = None,
     stamp_sigma_s: float | Sequence[float] = 0.0,
     max_steps: int = 60,

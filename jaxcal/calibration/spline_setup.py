@@ -10,9 +10,13 @@ from scipy.spatial.transform import Rotation, Slerp
 from jaxcal.calibration.assemble import round_up
 from jaxcal.calibration.inertial import INTERVAL_BATCH, ImuSamples
 from jaxcal.estimation import on_device
-from jaxcal.observations import ImuNoise
+from jaxcal.observations import ImuNoise, ImuRecording
 
+SPLINE_ORDER = 6  # unless one is asked for
 _RATES_HZ = (10.0, 15.0, 20.0, 30.0, 45.0, 70.0, 100.0)
+# Event frames are not made more often than this for a spline: shorter windows hold too little, and between them the IMU
+# says more.
+_MOST_FRAMES_HZ = 50.0
 # A knot rate is dense enough when a denser one lowers the IMU's residual by less than this share.
 _ENOUGH = 1.05
 
@@ -67,6 +71,15 @@ def choose_knot_rate(time_s: np.ndarray, gyro: np.ndarray, accel: np.ndarray, or
     # Each sensor asks for its own sparsest sufficient rate; the spline has to serve both.
     dense_enough = table <= _ENOUGH * table.min(axis=0)
     return float(rates[int(np.max(np.argmax(dense_enough, axis=0)))])
+
+
+def frame_rate_for_spline(imu: ImuRecording, order: int = SPLINE_ORDER, knot_rate_hz: float | None = None) -> float:
+    """How often (Hz) a camera should look for every knot interval of the spline to have a frame: the knot rate, given
+    or chosen as `calibrate_camera_imu` does from this recording; 50 Hz at most."""
+    if knot_rate_hz is None:
+        time_s = (imu.timestamps_ns - imu.timestamps_ns[0]) * 1e-9
+        knot_rate_hz = choose_knot_rate(time_s, imu.gyro_rad_s, imu.accel_m_s2, order)
+    return min(knot_rate_hz, _MOST_FRAMES_HZ)
 
 
 def _held_back_error(time_s: np.ndarray, values: np.ndarray, rate: float, degree: int) -> float:

@@ -55,6 +55,9 @@ def _for_the_screen(command: Any) -> Any:
 @click.option("--trigger_channel", type=int, help="Which trigger input, where there are several.")
 @click.option("--stamps_of", help="Frames at the times of these images: an EuRoC folder, or a topic of a bag.")
 @click.option("--time_offset_us", type=float, default=0.0, help="Added to the times given; half an exposure, say.")
+@click.option(
+    "--imu", help="Frames as often as a camera-IMU spline wants them: the IMU's readings (csv, npz, or a bag's topic)."
+)
 @click.option("--window_duration", "-T", type=float, help="A frame per so many milliseconds (33, if nothing is said).")
 @click.option("--window_size", "-N", type=click.IntRange(1), help="A frame per so many events.")
 @click.option("--num_events_per_pixel", type=float, help="A frame per so many events for each pixel; E2VID's is 0.35.")
@@ -95,6 +98,7 @@ def reconstruct(source: str | None, named_source: str | None, **options: Any) ->
     jaxcal reconstruct events.h5 --width 640 --height 480 --freq_hz 5 --upsample_rate 4 --output frames/
     jaxcal reconstruct drive.bag:/dvs/events --stamps_of drive.bag:/cam0/image_raw --output frames/
     jaxcal reconstruct recording.raw --triggers middle --hot_pixels auto --output frames/ --bag frames.bag
+    jaxcal reconstruct recording.raw --imu imu0/data.csv --output frames/
     jaxcal calibrate-cameras frames/ --target board.yaml --out result
 
     EVENTS is any event recording that `jaxcal info` knows. Frames carry the end of their window [t0, t1): every event
@@ -231,6 +235,7 @@ def _times(events: "EventFile", options: dict[str, Any]) -> "FrameTimes":
         options["window_duration"] = duration
     times = FrameTimes(
         window_ms=duration,
+        rate_hz=None if options["imu"] is None else _rate_for_spline(options["imu"]),
         timestamps=options["timestamps_file"],
         triggers=options["triggers"],
         stamps_of=options["stamps_of"],
@@ -239,10 +244,19 @@ def _times(events: "EventFile", options: dict[str, Any]) -> "FrameTimes":
         time_offset_ms=1e-3 * options["time_offset_us"],
         upsample_rate=options["upsample_rate"],
     )
-    ways = [*times.chosen(), *(["freq_hz"] if options["freq_hz"] > 0 else [])]
+    ways = ["imu" if name == "rate_hz" else name for name in times.chosen()]
+    ways = [*ways, *(["freq_hz"] if options["freq_hz"] > 0 else [])]
     if len(ways) > 1:
         raise click.UsageError(f"{' and '.join(ways)} each say when frames are wanted; give only one.")
     return times if ways else times.or_windows_of(_WINDOW_MS)
+
+
+def _rate_for_spline(data: str) -> float:
+    from jaxcal.calibration import frame_rate_for_spline
+    from jaxcal.observations import ImuNoise
+    from jaxcal.recording import load_imu
+
+    return frame_rate_for_spline(load_imu(ImuNoise(1.0, 1.0, 1.0, 1.0), data))  # its noise has no say here
 
 
 def _reconstructor_options(options: dict[str, Any]) -> dict[str, Any]:

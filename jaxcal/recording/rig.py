@@ -13,6 +13,7 @@ from jaxcal.recording.images import load_frames
 from jaxcal.recording.imu import load_imu, load_noise, noise_from_yaml
 from jaxcal.recording.rig_reconstruction import RigReconstruction, reconstruction_from_yaml
 from jaxcal.recording.tables import load_detections
+from jaxcal.recording.windows import BY_SPLINE
 from jaxcal.recording.yaml_files import (
     as_bool,
     as_mapping,
@@ -163,6 +164,11 @@ def _check_reconstruction(rig: Rig, where: str) -> None:
     if source is not None and source not in with_frames:
         raise CalibrationError(
             f"{where}.stamps_of: '{source}' is no camera with 'frames'; those are {', '.join(with_frames) or 'none'}."
+        )
+    if rig.reconstruction.times.rate_hz == BY_SPLINE and not rig.imus:
+        raise CalibrationError(
+            f"{where}.rate_hz: '{BY_SPLINE}' takes the rate from the IMU's readings, and this rig has no 'imu'. Give a "
+            "number of frames per second, or leave it out."
         )
     hot_pixels = rig.reconstruction.options.get("hot_pixels")
     if hot_pixels not in (None, "auto") and sum(camera.events is not None for camera in rig.cameras) > 1:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxcal.errors import CalibrationError
-from jaxcal.recording.windows import TRIGGER_EDGES, FrameTimes
+from jaxcal.recording.windows import BY_SPLINE, TRIGGER_EDGES, FrameTimes
 from jaxcal.recording.yaml_files import as_mapping, as_positive, as_text, check_keys, existing_path
 
 PRECISIONS = ("auto", "float32", "bfloat16", "float16")
@@ -51,10 +51,14 @@ def _one_of(*known: str) -> Callable[[Any, str], str]:
     return check
 
 
+def _rate(content: Any, where: str) -> float | str:
+    return content if content == BY_SPLINE else as_positive(content, where)
+
+
 # Key -> how its value is read. Those in _PATHS are files instead, relative to the rig.
 _TIMES: dict[str, Callable[[Any, str], Any]] = {
     "window_ms": as_positive,
-    "rate_hz": as_positive,
+    "rate_hz": _rate,
     "triggers": _one_of(*TRIGGER_EDGES),
     "stamps_of": as_text,
     "events_per_window": _count,

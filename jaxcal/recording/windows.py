@@ -18,6 +18,7 @@ from jaxcal.recording.formats.contract import Triggers
 _log = logging.getLogger(__name__)
 
 TRIGGER_EDGES = ("rising", "falling", "middle")
+BY_SPLINE = "auto"  # as `rate_hz`
 _MAX_WINDOWS = 500_000
 # Where frames are asked for at given times, a window longer than so many usual ones is divided; and how long windows
 # are where one time tells of no usual length.
@@ -112,18 +113,19 @@ class FrameTimes:
     """When frames of an event camera are wanted; at most one of the first six says so.
 
     `window_ms`: windows of this length, ending at whole multiples of it, so that cameras on one clock share their
-    times. `rate_hz`: the same by their number per second. `timestamps`: a text file with a time in microseconds per
-    line (e2calib's `--timestamps_file`). `triggers`: at the 'rising' or 'falling' edges of the event file's external
-    trigger, or in the 'middle' between a rising one and the falling one behind it (mid-exposure, where a frame camera
-    signals its exposure); `trigger_channel` where there are several. `stamps_of`: at the frames of this camera of the
-    rig. `events_per_window`: whenever so many events have come.
+    times. `rate_hz`: the same by their number per second; 'auto': one for each knot interval of the spline on which
+    cameras are calibrated with an IMU, as `calibration.frame_rate_for_spline` tells. `timestamps`: a text file with a
+    time in microseconds per line (e2calib's `--timestamps_file`). `triggers`: at the 'rising' or 'falling' edges of the
+    event file's external trigger, or in the 'middle' between a rising one and the falling one behind it (mid-exposure,
+    where a frame camera signals its exposure); `trigger_channel` where there are several. `stamps_of`: at the frames of
+    this camera of the rig. `events_per_window`: whenever so many events have come.
 
     `time_offset_ms` is added to times that were given (a camera that stamps the start of its exposure: half of that).
     `upsample_rate`: so many windows, of equal length, for each frame, of which the last one's is kept (as e2calib's).
     """
 
     window_ms: float | None = None
-    rate_hz: float | None = None
+    rate_hz: float | str | None = None
     timestamps: Path | None = None
     triggers: str | None = None
     stamps_of: str | None = None
@@ -148,7 +150,8 @@ class FrameTimes:
 
         `stamps_ns` the times of the frames of the camera `stamps_of`.
 
-        Raises CalibrationError when not exactly one thing says when frames are wanted, or none falls in the recording.
+        Raises CalibrationError when not exactly one thing says when frames are wanted, or none falls in the recording,
+        or when nobody has put a number in the place of 'auto'.
         """
         chosen = self.chosen()
         if len(chosen) != 1:
@@ -166,6 +169,11 @@ class FrameTimes:
             return CountedWindows(self.events_per_window, self.upsample_rate, span_ns)
         if self.window_ms is not None:
             return periodic(events, round(self.window_ms * 1e6), span_ns=span_ns, upsample_rate=self.upsample_rate)
+        if isinstance(self.rate_hz, str):
+            raise CalibrationError(
+                f"Frame times: rate_hz is '{self.rate_hz}'; without an IMU there is no spline that wants frames. "
+                "Give a number of frames per second."
+            )
         if self.rate_hz is not None:
             return periodic(events, _period(self.rate_hz), span_ns=span_ns, upsample_rate=self.upsample_rate)
         if self.timestamps is not None:

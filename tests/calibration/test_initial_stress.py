@@ -50,6 +50,21 @@ def test_the_lower_of_two_optima_in_a_curved_valley_is_found_and_its_rival_named
     assert "rival" in row.message
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "model"),
+    [
+        pytest.param(325, "ds-none", id="two optima on either side of xi = 0, hundreds of sigmas apart"),
+        pytest.param(219, "pinhole-thinprism12", id="a first lens behind a pole of its denominator"),
+    ],
+)
+def test_what_looked_best_at_first_is_left_for_a_better_lens(stress: ModuleType, number: int, model: str) -> None:
+    """Problems 219 and 325 of `stress_initialisation.py --seed 0`."""
+    problem = stress.random_problem(np.random.default_rng([0, number]), model)
+    row = stress.solve(number, problem)
+    assert (row.outcome, row.message) == ("optimum", "")
+
+
 def test_the_same_number_gives_the_same_problem_and_the_table_counts_it(stress: ModuleType, tmp_path: Path) -> None:
     first, second = (stress.random_problem(np.random.default_rng([3, 1]), "pinhole-none") for _ in range(2))
     np.testing.assert_array_equal(first.frames.pixels, second.frames.pixels)

@@ -198,3 +198,20 @@ def test_help_teaches_by_example():
     assert "jaxcal reconstruct recording.raw --output frames/" in result.output
     assert "--unsharp_mask_amount" in result.output
     assert "--gamma" not in result.output
+
+
+@pytest.mark.parametrize(("wiggle_hz", "expected_ms"), [(0.5, 100.0), (12.0, 20.0)])
+def test_frames_as_often_as_a_spline_wants_them(run: Any, tmp_path: Path, wiggle_hz: float, expected_ms: float):
+    """Slow motion: the sparsest spline, 10 knots a second; fast motion: a frame per 20 ms, and no more."""
+    time = np.arange(0.0, 4.0, 0.005)
+    wave = np.sin(2.0 * np.pi * wiggle_hz * time)[:, None]
+    noise = 1e-3 * np.random.default_rng(0).standard_normal((len(time), 6))
+    readings = np.concatenate([wave * [1.0, 0.5, 0.2], wave * [3.0, 2.0, 1.0] + [0.0, 0.0, 9.81]], axis=1) + noise
+    stamps = 1000 * T0_US + np.round(1e9 * time).astype(np.int64)
+    rows = [f"{t},{','.join(f'{value:.9f}' for value in row)}" for t, row in zip(stamps, readings, strict=True)]
+    (tmp_path / "imu.csv").write_text("\n".join(["#timestamp [ns],w,w,w,a,a,a", *rows]) + "\n")
+    result = run("--imu", tmp_path / "imu.csv", "--output", tmp_path / "frames")
+    assert result.exit_code == 0, result.output
+    np.testing.assert_allclose(np.diff(listing(tmp_path / "frames")), 1e6 * expected_ms)
+    result = run("--imu", tmp_path / "imu.csv", "-T", "20", "--output", tmp_path / "other")
+    assert "imu each say when frames are wanted" in result.output

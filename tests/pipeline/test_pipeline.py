@@ -373,6 +373,20 @@ def test_event_frames_at_the_stamps_of_a_frame_camera(
     assert np.array_equal(handed_over["cam0"].timestamps_ns, times + 2_500_000)
 
 
+def test_event_frames_for_each_knot_of_the_spline(
+    event_rig: Path, network: SimpleNamespace, handed_over: dict[str, Frames]
+) -> None:
+    times = 1000 * T0_US + np.arange(200) * 1_000_000
+    rows = [f"{t},{0.1 * np.sin(n)},0,0,0,0,9.81" for n, t in enumerate(times)]
+    (event_rig.parent / "imu.csv").write_text("\n".join(["#t,w,w,w,a,a,a", *rows]) + "\n")
+    noise = dict.fromkeys(("gyroscope_noise_density", "gyroscope_random_walk"), 1e-3)
+    noise |= dict.fromkeys(("accelerometer_noise_density", "accelerometer_random_walk"), 1e-2)
+    imu = {"data": "imu.csv", "noise": noise | {"update_rate": 1000.0}}
+    add_to_rig(event_rig, imu=imu, reconstruction={"rate_hz": "auto"}, calibration={"knot_rate_hz": 40.0})
+    walk(event_rig)
+    np.testing.assert_array_equal(np.diff(handed_over["cam0"].timestamps_ns), 25_000_000)
+
+
 def test_recordings_shorter_than_a_window_or_endless_are_refused(event_rig: Path, network: SimpleNamespace) -> None:
     with pytest.raises(CalibrationError, match=r"cam0.h5: the recording is .* ms long, shorter than one window"):
         run_pipeline(event_rig, event_rig.parent / "out", settings=PipelineSettings(window_ms=10_000.0))

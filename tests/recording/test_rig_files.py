@@ -170,6 +170,7 @@ def change(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
         ("calibration", ["views"], "calibration: expected 'key: value' lines"),
         ("reconstruction.window", 20, "reconstruction: unknown key 'window'. Did you mean 'window_ms'"),
         ("reconstruction.rate_hz", 20, "reconstruction: window_ms and rate_hz each say when frames are wanted"),
+        ("reconstruction.rate_hz", "often", "reconstruction.rate_hz: expected a positive number"),
         ("reconstruction.stamps_off", "cam1", "unknown key 'stamps_off'. Did you mean 'stamps_of'"),
         ("reconstruction.hotpixels", "auto", "unknown key 'hotpixels'. Did you mean 'hot_pixels'"),
         ("reconstruction.hot_pixels", "absent.txt", "reconstruction.hot_pixels: .* does not exist"),
@@ -233,6 +234,10 @@ def test_the_reconstruction_is_read_in_full(tmp_path: Path, content: dict[str, A
 def test_the_reconstruction_must_fit_the_cameras(tmp_path: Path, content: dict[str, Any]) -> None:
     content["reconstruction"] = {"stamps_of": "cam1"}
     assert load_rig(write(tmp_path, content)).reconstruction.times.stamps_of == "cam1"
+    content["reconstruction"] = {"rate_hz": "auto"}
+    assert load_rig(write(tmp_path, content)).reconstruction.times.rate_hz == "auto"
+    with pytest.raises(CalibrationError, match="rate_hz: 'auto' takes the rate from the IMU's readings"):
+        load_rig(write(tmp_path, {key: value for key, value in content.items() if key != "imu"}))
     content["reconstruction"] = {"stamps_of": "cam0"}
     with pytest.raises(CalibrationError, match="stamps_of: 'cam0' is no camera with 'frames'; those are cam1"):
         load_rig(write(tmp_path, content))
