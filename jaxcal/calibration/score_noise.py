@@ -8,10 +8,9 @@ White 1980 with the weights over lags of Newey and West 1987, "A simple, positiv
 autocorrelation consistent covariance matrix", eq. 5), and compared with that matrix.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 
+from jaxcal.calibration.model_lens import ModelLens
 from jaxcal.cameras import CameraModel
 
 # Lags up to this share of the views are looked at.
@@ -22,8 +21,7 @@ _BEYOND_CHANCE = 5.0
 _MOST_PARAMETERS = 24
 _FEWEST_VIEWS = 8
 _FEWEST_CORNERS = 6
-_AT_ONCE = 500  # views, for memory
-_STEP = 1e-6
+_AT_ONCE = 2_000_000  # derivatives, for memory
 
 
 def design_effect(
@@ -38,12 +36,12 @@ def design_effect(
     taken = np.flatnonzero((weights > 0).sum(axis=1) >= _FEWEST_CORNERS)
     if len(taken) < _FEWEST_VIEWS:
         return 1.0
+    views = max(_AT_ONCE // (len(points) * len(np.asarray(model.parameters))), 1)
     parts = [
         _scores(model, points, poses[some], errors[some], weights[some])
-        for some in np.array_split(taken, -(-len(taken) // _AT_ONCE))
+        for some in np.array_split(taken, -(-len(taken) // views))
     ]
     scores, of_views = (np.concatenate(part) for part in zip(*parts, strict=True))
-    # Steps may leave the lens' domain where a corner lies on its border.
     fine = np.isfinite(scores).all(axis=1) & np.isfinite(of_views).all(axis=(1, 2))
     if fine.sum() < _FEWEST_VIEWS:
         return 1.0
@@ -89,21 +87,12 @@ def _scatter(scores: np.ndarray, expected: np.ndarray) -> float:
 
 def _derivatives(model: CameraModel, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of the pixels of points (F, N, 3) in the camera's frame by the lens (F, N, 2, P) and by the pose
-    (F, N, 2, 6), by differences: exact ones would need a program for every lens and number of views."""
+    (F, N, 2, 6), rotation first; zeros where a point cannot be projected."""
     parameters = np.asarray(model.parameters)
-    chosen = np.linspace(0, len(parameters) - 1, min(len(parameters), _MOST_PARAMETERS)).astype(int).tolist()
-
-    def of_lens(k: int, step: float) -> np.ndarray:
-        changed = parameters.copy()
-        changed[k] += step
-        return np.asarray(model.with_parameters(changed).project(seen))
-
-    def of_pose(k: int, step: float) -> np.ndarray:
-        axis = np.eye(3)[k % 3]
-        return np.asarray(model.project(seen + step * (np.cross(axis, seen) if k < 3 else axis)))
-
-    def slope(value: Callable[[int, float], np.ndarray], k: int, step: float) -> np.ndarray:
-        return (value(k, step) - value(k, -step)) / (2.0 * step)
-
-    by_lens = [slope(of_lens, k, _STEP * max(1.0, float(abs(parameters[k])))) for k in chosen]
-    return np.stack(by_lens, axis=-1), np.stack([slope(of_pose, k, _STEP) for k in range(6)], axis=-1)
+    chosen = np.linspace(0, len(parameters) - 1, min(len(parameters), _MOST_PARAMETERS)).astype(int)
+    found = ModelLens(model).project(parameters[None], seen.swapaxes(-1, -2)[None], True)
+    assert found.by_lens is not None
+    by_lens = np.transpose(found.by_lens[0][:, chosen], (0, 3, 2, 1))
+    by_point = np.transpose(found.by_point[0], (0, 3, 1, 2))
+    by_turn = np.cross(seen[..., None, :], by_point)  # a turn w moves a point by w x point
+    return by_lens, np.concatenate([by_turn, by_point], axis=-1)
