@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Any
 import jax
 import platformdirs
 
+from jaxcal.compiler import choose_code_generator
+
+choose_code_generator()
 # Estimation is in double precision; this is the one place that says so.
 jax.config.update("jax_enable_x64", True)
 # Compiled programs are kept between runs, unless the user has chosen a place or switched it off.

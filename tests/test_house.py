@@ -1,6 +1,7 @@
 """The rules of the house, checked on its source: who imports whom, what an import costs, what is public."""
 
 import ast
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ ALLOWED: dict[str, set[str]] = {
     "jaxcal.errors": set(),
     "jaxcal.progress": set(),
     "jaxcal.atomic": set(),
+    "jaxcal.compiler": set(),
     "jaxcal.observations": set(),
     "jaxcal.cameras": set(),
     "jaxcal.trajectory": set(),
@@ -190,6 +192,27 @@ def test_every_public_name_is_there_and_listed() -> None:
         assert name in dir(jaxcal)
     with pytest.raises(AttributeError, match="module 'jaxcal' has no attribute 'calibrate_everything'"):
         jaxcal.calibrate_everything  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_the_code_generator_is_chosen_and_the_environment_left_alone() -> None:
+    """XLA's options as bytes, in processes of their own: flags are read once."""
+
+    def options(code: str, flags: str) -> str:
+        code = f"{code}; import os; from jaxlib import xla_client"
+        code += "; print(xla_client.CompileOptions().SerializeAsString().hex(), os.environ.get('XLA_FLAGS'))"
+        environment = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"}
+        environment |= {"XLA_FLAGS": flags} if flags else {}
+        command = [sys.executable, "-c", code]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.strip()
+
+    chosen, _ = options("import jax", "--xla_cpu_use_fusion_emitters=false").split(" ")
+    assert options("import jaxcal", "") == f"{chosen} None"
+    assert options("import jax", "") != f"{chosen} None"
+    other = "--xla_cpu_use_fusion_emitters=true"
+    assert options("import jaxcal", other) == options("import jax", other)
+    beside = "--xla_cpu_multi_thread_eigen=false"
+    assert options("import jaxcal", beside).endswith(f" {beside}")
+    assert options("import jaxcal", beside) != options("import jax", beside)
 
 
 def test_estimation_is_in_double_precision() -> None:
