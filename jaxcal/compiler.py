@@ -13,8 +13,8 @@ _FLAG, _FIRST_WITHOUT = "xla_cpu_use_fusion_emitters", (0, 11)
 def choose_code_generator() -> None:
     """Set the flag for this process, unless the user's XLA_FLAGS have an opinion, or jax has compiled already.
 
-    XLA reads its flags once. The environment is as before afterwards: in a process with another jaxlib, to which an
-    unknown flag is fatal, it must not be found.
+    XLA reads its flags once, and from here on: XLA_FLAGS have to be set before jaxcal is imported. The environment is
+    as before afterwards: in a process with another jaxlib, to which an unknown flag is fatal, it must not be found.
     """
     release = tuple(int(part) for part in jaxlib.version.__version__.split(".")[:2])
     before = os.environ.get("XLA_FLAGS")
