@@ -13,7 +13,7 @@ from jaxcal.calibration.checks import resolve_models, resolve_names
 from jaxcal.calibration.extra_imus import OtherImu
 from jaxcal.calibration.inertial import InertialData
 from jaxcal.calibration.initial_imu import Alignment, CameraTrack
-from jaxcal.calibration.initial_lens import POSE_START_CORNERS, board_poses, initial_lens
+from jaxcal.calibration.initial_lens import board_poses, initial_lens
 from jaxcal.calibration.lens_basis import own_parameters
 from jaxcal.calibration.outcome import calibration_from, chain_covariance_and_sentences
 from jaxcal.calibration.problem import LensPrior, RigProblem
@@ -222,7 +222,7 @@ def _align_all(
     times, tracks, alignments, sigmas = [], [], [], []
     for name, lens, camera in zip(names, lenses, frames, strict=True):
         time = (camera.time_ns - imu.timestamps_ns[0]) * 1e-9
-        R_cam_target, t_cam_target, error = board_poses(lens, camera, target, most_corners=POSE_START_CORNERS)
+        R_cam_target, t_cam_target, error = board_poses(lens, camera, target)
         good = error <= max(4.0 * float(np.median(error)), 0.2)
         R_target_cam = R_cam_target[good].swapaxes(-1, -2)
         position = -np.einsum("fij,fj->fi", R_target_cam, t_cam_target[good])

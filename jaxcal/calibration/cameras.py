@@ -10,7 +10,7 @@ from jaxcal.calibration.assemble import CameraFrames, camera_frames
 from jaxcal.calibration.board_checks import check_board
 from jaxcal.calibration.board_turns import symmetry_sentences, unify_turns
 from jaxcal.calibration.checks import resolve_models, resolve_names
-from jaxcal.calibration.initial_lens import POSE_START_CORNERS, board_poses, initial_lens_and_rivals
+from jaxcal.calibration.initial_lens import board_poses, initial_lens_and_rivals
 from jaxcal.calibration.outcome import calibration_from, chain_covariance_and_sentences
 from jaxcal.calibration.poses import Poses
 from jaxcal.calibration.problem import RigProblem
@@ -188,10 +188,7 @@ def _first_look(
     tracked = track(work, "initial lenses", len(work), progress)
     firsts = [initial_lens_and_rivals(n, m, b.frames, target) for n, m, b in tracked]
     lenses = [first.lens for first in firsts]
-    found = [
-        board_poses(lens, b.frames, target, most_corners=POSE_START_CORNERS)
-        for lens, b in zip(lenses, boards, strict=True)
-    ]
+    found = [board_poses(lens, b.frames, target) for lens, b in zip(lenses, boards, strict=True)]
     poses = [(rotation, translation) for rotation, translation, _ in found]
     rivals = [first.rivals for first in firsts]
     return _Look(lenses, rivals, list(cameras), boards, poses, [error for *_, error in found], sentences)

@@ -50,8 +50,6 @@ _LOST = 0.005
 _SUSPECT = 1.6
 _POSE_STEPS = 12
 _POSE_CORNERS = 32_300  # corners at once: they just fill a large piece of `ModelLens`
-# Corners of a frame that are enough to start its pose from.
-POSE_START_CORNERS = 48
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,11 +118,10 @@ def initial_lenses(
     return [initial_lens(n, m, f, target) for n, m, f in zip(names, models, cameras, strict=True)]
 
 
-def board_poses(
-    model: CameraModel, frames: CameraFrames, target: Target, *, most_corners: int | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """T_cam_target of every frame through a known lens, the better of the two poses that a flat board allows; from so
-    many corners of each frame, evenly chosen (None: all).
+def board_poses(model: CameraModel, frames: CameraFrames, target: Target) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """T_cam_target of every frame through a known lens, the better of the two poses that a flat board allows.
+
+    It takes all corners to tell which is the better one through a narrow lens; a third of them was not enough.
 
     Returns rotations (F, 3, 3), translations (F, 3) and the root mean square error (F,), px, of each.
     """
@@ -134,11 +131,10 @@ def board_poses(
     parts = []
     with single_threaded_blas():
         generic = generic_of(model, frames.detections.image_size)
-        width = min(len(target.points), most_corners or len(target.points))
-        chunk = max(_POSE_CORNERS // width, 1)
+        chunk = max(_POSE_CORNERS // len(target.points), 1)
         for first in range(0, len(frames.frames), chunk):
             part = slice(first, first + chunk)
-            views = compact_views(target.points, frames.pixels[part], frames.seen[part], most_corners)
+            views = compact_views(target.points, frames.pixels[part], frames.seen[part])
             fit = _poses_from_rays(lens, parameters, *generic_lens.unproject(generic, views.pixels), views, far)
             squared = squared_errors(lens, fit, views, far=1e6)[0]
             error = np.sqrt(np.sum(squared * views.weight, axis=1) / views.weight.sum(axis=1))
