@@ -11,9 +11,8 @@ from jaxcal.calibration import solving
 from jaxcal.calibration.assemble import CameraFrames, camera_frames, split_groups, stack_groups, stack_weights
 from jaxcal.calibration.lens_basis import told_apart
 from jaxcal.calibration.poses import Poses
-from jaxcal.calibration.problem import RigProblem
+from jaxcal.calibration.problem import RigProblem, corner_errors
 from jaxcal.calibration.redundancy import measure_redundancy
-from jaxcal.calibration.robust import corner_errors
 from jaxcal.calibration.state import RigState, SharedLayout, layout_of
 from jaxcal.calibration.target_shape import geometry_of
 from jaxcal.calibration.validation import known_graph, known_target

@@ -24,7 +24,7 @@ from scipy.special import chdtrc  # scipy.stats says the same, and takes half a 
 
 from jaxcal.calibration.assemble import split_groups
 from jaxcal.calibration.known import KnownProblem
-from jaxcal.calibration.robust import camera_poses
+from jaxcal.calibration.problem import camera_poses
 from jaxcal.cameras import CameraModel
 from jaxcal.results import Calibration
 from jaxcal.results.cross_validation import FALSE_ALARMS, Cause, Evidence

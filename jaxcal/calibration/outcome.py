@@ -10,7 +10,8 @@ from jaxcal.calibration import observability, outliers, uncertainty
 from jaxcal.calibration.assemble import CameraFrames, split_groups, stack_weights
 from jaxcal.calibration.checks import versions
 from jaxcal.calibration.lens_basis import to_parameters
-from jaxcal.calibration.robust import RobustFit, camera_poses
+from jaxcal.calibration.problem import camera_poses
+from jaxcal.calibration.robust import RobustFit
 from jaxcal.calibration.rolling import check_readout
 from jaxcal.calibration.score_noise import design_effect
 from jaxcal.calibration.state import RigState, SharedLayout, camera_model_of, transform

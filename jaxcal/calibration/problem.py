@@ -217,3 +217,15 @@ class RigProblem(eqx.Module):
                 corner = corner.at[rows, rows].add(information[place])
                 gradient = gradient.at[rows].add(force[place])
         return eqx.tree_at(lambda e: (e.corner, e.gradient_shared, e.cost), equations, (corner, gradient, cost))
+
+
+@eqx.filter_jit
+def corner_errors(problem: RigProblem, state: RigState) -> tuple:
+    """Projection minus measurement, px, per group."""
+    return problem.corner_errors(state)
+
+
+@eqx.filter_jit
+def camera_poses(problem: RigProblem, state: RigState) -> tuple:
+    """T_cam_target (F, 4, 4) of every frame, per group."""
+    return problem.camera_poses(state)

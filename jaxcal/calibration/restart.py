@@ -11,8 +11,8 @@ from jaxtyping import Array
 from scipy.linalg import solveh_banded
 
 from jaxcal.calibration.assemble import CameraFrames, split_groups
-from jaxcal.calibration.problem import LensPrior, RigProblem
-from jaxcal.calibration.robust import RobustFit, corner_errors
+from jaxcal.calibration.problem import LensPrior, RigProblem, corner_errors
+from jaxcal.calibration.robust import RobustFit
 from jaxcal.calibration.state import RigState, SharedLayout
 from jaxcal.calibration.uncertainty import shared_information
 from jaxcal.cameras import CameraModel

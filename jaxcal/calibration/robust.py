@@ -10,7 +10,8 @@ import numpy as np
 from jaxcal.calibration import outliers
 from jaxcal.calibration.assemble import CameraFrames, split_groups, stack_weights
 from jaxcal.calibration.lens_basis import told_apart
-from jaxcal.calibration.problem import RigProblem
+from jaxcal.calibration.mirrored import turn_mirrored
+from jaxcal.calibration.problem import RigProblem, corner_errors
 from jaxcal.calibration.redundancy import Redundancy, measure_redundancy
 from jaxcal.calibration.state import RigState
 from jaxcal.calibration.view_noise import all_alike, weigh_views
@@ -50,18 +51,6 @@ class RobustFit:
     @property
     def state(self) -> RigState:
         return self.result.state
-
-
-@eqx.filter_jit
-def corner_errors(problem: RigProblem, state: RigState) -> tuple:
-    """Projection minus measurement, px, per group."""
-    return problem.corner_errors(state)
-
-
-@eqx.filter_jit
-def camera_poses(problem: RigProblem, state: RigState) -> tuple:
-    """T_cam_target (F, 4, 4) of every frame, per group."""
-    return problem.camera_poses(state)
 
 
 def robust_fit(
@@ -110,7 +99,8 @@ def robust_fit(
             rtol=0.0 if last else _ENOUGH_FOR_NOISE,
             damping=FIRST_DAMPING if result is None else _NEXT_DAMPING,
         )
-        state = result.state
+        # With the noise known and the lens near its optimum: before views and corners are judged by their errors.
+        state = turn_mirrored(problem, result.state, max_steps) if stage == 1 else result.state
         errors = split_groups(layout, cameras, [np.asarray(e) for e in corner_errors(problem, state)])
         # In units of an ordinary corner: what a detector knows to be vague may err more.
         scaled = _in_usual_units(errors, cameras, noise)
