@@ -4,18 +4,9 @@ import importlib
 import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
-import jax
-import platformdirs
+from jaxcal.jax_settings import configure_jax
 
-from jaxcal.compiler import choose_code_generator
-
-choose_code_generator()
-# Estimation is in double precision; this is the one place that says so.
-jax.config.update("jax_enable_x64", True)
-# Compiled programs are kept between runs, unless the user has chosen a place or switched it off.
-if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
-    jax.config.update("jax_compilation_cache_dir", platformdirs.user_cache_dir("jaxcal") + "/xla")
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+configure_jax()
 
 # name -> module that defines it; imported when first asked for, so that `import jaxcal` stays quick.
 _EXPORTS = {

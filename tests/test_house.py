@@ -20,7 +20,7 @@ ALLOWED: dict[str, set[str]] = {
     "jaxcal.errors": set(),
     "jaxcal.progress": set(),
     "jaxcal.atomic": set(),
-    "jaxcal.compiler": set(),
+    "jaxcal.jax_settings": set(),
     "jaxcal.observations": set(),
     "jaxcal.cameras": set(),
     "jaxcal.trajectory": set(),
@@ -180,7 +180,7 @@ def test_only_the_reconstruction_imports_torch() -> None:
 
 
 def test_importing_jaxcal_is_light() -> None:
-    heavy = ("torch", "cv2", "matplotlib", "h5py", "scipy.optimize", "numba")
+    heavy = ("jax", "torch", "cv2", "matplotlib", "h5py", "scipy.optimize", "numba")
     code = f"import sys, jaxcal; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert done.stdout.strip() == "[]"
@@ -206,18 +206,33 @@ def test_the_code_generator_is_chosen_and_the_environment_left_alone() -> None:
         return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.strip()
 
     chosen, _ = options("import jax", "--xla_cpu_use_fusion_emitters=false").split(" ")
-    assert options("import jaxcal", "") == f"{chosen} None"
+    assert options("import jaxcal, jax", "") == f"{chosen} None"
     assert options("import jax", "") != f"{chosen} None"
     other = "--xla_cpu_use_fusion_emitters=true"
-    assert options("import jaxcal", other) == options("import jax", other)
+    assert options("import jaxcal, jax", other) == options("import jax", other)
     beside = "--xla_cpu_multi_thread_eigen=false"
-    assert options("import jaxcal", beside).endswith(f" {beside}")
-    assert options("import jaxcal", beside) != options("import jax", beside)
+    assert options("import jaxcal, jax", beside).endswith(f" {beside}")
+    assert options("import jaxcal, jax", beside) != options("import jax", beside)
 
 
-def test_estimation_is_in_double_precision() -> None:
-    code = "import jaxcal, jax.numpy as jnp; assert jnp.zeros(1).dtype == 'float64'"
+@pytest.mark.parametrize(
+    "imports",
+    [
+        "import jaxcal, jax.numpy as jnp",
+        "import jax.numpy as jnp, jaxcal",
+        "import jaxcal, importlib.util as u; assert u.find_spec('jax').loader; import jax.numpy as jnp",
+        "import jaxcal.cameras; from jax import numpy as jnp",
+    ],
+)
+def test_whoever_imports_jaxcal_has_jax_in_double_precision_with_programs_on_the_disk(imports: str) -> None:
+    code = f"{imports}; import jax; assert jnp.zeros(1).dtype == 'float64'; assert jax.config.jax_compilation_cache_dir"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_help_needs_no_jax() -> None:
+    code = "import sys; from jaxcal.cli import main; main(['--help'], standalone_mode=False)"
+    code += "; assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
 def test_library_modules_never_print_and_never_exit() -> None:

@@ -1,5 +1,8 @@
 """`jaxcal report`: the report of a calibration that was saved, anew."""
 
+import contextlib
+import gc
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
@@ -35,6 +38,23 @@ def report(result: Path, sources: tuple[str, ...], out: Path | None, rerun: Path
     RESULT is a folder of jaxcal's, or its calibration.npz. A calibration does not hold pictures: without --images the
     page shows none. What `jaxcal cross-validate RESULT` found is shown, too.
     """
+    with _garbage_left():
+        _report(result, sources, out, rerun)
+
+
+@contextlib.contextmanager
+def _garbage_left() -> Iterator[None]:
+    """No search for garbage, which takes a second in ten through all that jax and the figures hold: not meanwhile, nor
+    afterwards in what is here now. The process ends after one page."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+def _report(result: Path, sources: tuple[str, ...], out: Path | None, rerun: Path | None) -> None:
     from jaxcal.cli.progress_bars import ProgressBars
     from jaxcal.errors import CalibrationError
     from jaxcal.recording import load_frames

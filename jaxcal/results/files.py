@@ -27,7 +27,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.atomic import write_bytes, write_text
@@ -297,7 +296,7 @@ def _decode_camera(entry: dict[str, Any], index: int, arrays: dict[str, np.ndarr
         )
     return CameraCalibration(
         name=entry["name"],
-        model=template.with_parameters(jnp.asarray(mine["parameters"])),
+        model=template.with_parameters(mine["parameters"]),
         image_size=(width, height),
         T_cn_cnm1=mine.get("T_cn_cnm1"),
         T_cam_imu=mine.get("T_cam_imu"),

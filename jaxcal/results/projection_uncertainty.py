@@ -133,10 +133,8 @@ def projection_covariance(
         np.asarray(part)
         for part in _sensitivities(
             chosen.model,
-            jnp.asarray(padded),
-            jnp.asarray(np.pad(weight, (0, count - len(corners)))),
-            jnp.asarray(rays),
-            jnp.asarray(inverse_range),
+            # Without a program for each shape, as `jnp.asarray` would have.
+            *map(jax.device_put, (padded, np.pad(weight, (0, count - len(corners))), rays, np.float64(inverse_range))),
         )
     )
     moved = of_lens - of_pose @ implied_motion(normal, right)

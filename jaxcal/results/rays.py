@@ -18,7 +18,7 @@ def rays_through(model: CameraModel, pixels: np.ndarray) -> tuple[np.ndarray, np
     """Unit rays (K, 3) of a lens through pixels (K, 2), and whether each is its pixel's, in the lens's domain (K,)."""
     count = -(-max(len(pixels), 1) // _STEP) * _STEP
     padded = np.pad(np.asarray(pixels, dtype=np.float64), ((0, count - len(pixels)), (0, 0)), mode="edge")
-    rays, valid = _rays_through(model, jnp.asarray(padded))
+    rays, valid = _rays_through(model, jax.device_put(padded))
     return np.asarray(rays)[: len(pixels)], np.asarray(valid)[: len(pixels)]
 
 
