@@ -13,8 +13,9 @@ from jaxcal.calibration.checks import resolve_models, resolve_names
 from jaxcal.calibration.extra_imus import OtherImu
 from jaxcal.calibration.inertial import InertialData
 from jaxcal.calibration.initial_imu import Alignment, CameraTrack
-from jaxcal.calibration.initial_lens import board_poses, initial_lens
+from jaxcal.calibration.initial_lens import initial_lens
 from jaxcal.calibration.lens_basis import own_parameters
+from jaxcal.calibration.lens_poses import board_poses
 from jaxcal.calibration.outcome import calibration_from, chain_covariance_and_sentences
 from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.robust import robust_fit

@@ -10,7 +10,8 @@ from jaxcal.calibration.assemble import CameraFrames, camera_frames
 from jaxcal.calibration.board_checks import check_board
 from jaxcal.calibration.board_turns import symmetry_sentences, unify_turns
 from jaxcal.calibration.checks import resolve_models, resolve_names
-from jaxcal.calibration.initial_lens import board_poses, initial_lens_and_rivals
+from jaxcal.calibration.initial_lens import initial_lens_and_rivals
+from jaxcal.calibration.lens_poses import board_poses
 from jaxcal.calibration.outcome import calibration_from, chain_covariance_and_sentences
 from jaxcal.calibration.poses import Poses
 from jaxcal.calibration.problem import RigProblem

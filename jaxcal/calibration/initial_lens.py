@@ -1,4 +1,4 @@
-"""A first lens and first board poses from the views of one camera alone, with no guess from the user.
+"""A first lens from the views of one camera alone, with no guess from the user.
 
 A sweep over lenses of all kinds (`generic_lens`) on a few views finds the field of view; the best of them are refined
 on more views, and the model that was asked for is fitted to the winner and refined on the same views.
@@ -8,16 +8,15 @@ import dataclasses
 import logging
 from collections.abc import Iterator, Sequence
 
-import cv2
 import numpy as np
 
 from jaxcal.calibration import generic_lens
 from jaxcal.calibration.assemble import CameraFrames
-from jaxcal.calibration.first_fit import Fit, Lens, Views, compact_views, fit_lenses, fit_poses, squared_errors
+from jaxcal.calibration.first_fit import Fit, Lens, Views, compact_views, fit_lenses, squared_errors
 from jaxcal.calibration.generic_lens import GenericLens
-from jaxcal.calibration.initial_poses import mirrored_poses, planar_poses
+from jaxcal.calibration.generic_search import Found, generic_candidates, spread_views, trimmed_rms
+from jaxcal.calibration.lens_poses import HUBER_PX, swap_mirrored
 from jaxcal.calibration.model_lens import ModelLens
-from jaxcal.calibration.redundancy import view_features
 from jaxcal.cameras import CameraModel
 from jaxcal.cameras.refit import fit_rays
 from jaxcal.errors import CalibrationError
@@ -26,15 +25,8 @@ from jaxcal.targets import Target
 
 logger = logging.getLogger(__name__)
 
-# Views and corners per view: of the sweep, of the refinement of its best hypotheses, of the model's own.
-_SWEEP_VIEWS, _SWEEP_CORNERS = 10, 40
-_GENERIC_VIEWS, _GENERIC_CORNERS = 24, 80
+# Views that the requested model is fitted to.
 _MODEL_VIEWS = 60
-_MOST_FINALISTS = 3
-# Corner errors (px) up to which they count in full.
-_HUBER_PX = 3.0
-# Corner noise (px) taken for granted until it is known, in the scale of priors alone.
-_FIRST_NOISE_PX = 0.1
 # The share of their usual spread that parameters have at the start.
 _START_SPREAD = 0.3
 # Information on parameters that are held: nothing that corners say comes near.
@@ -48,21 +40,6 @@ _RIVAL_COST, _SAME_LENS = 1.02, 1e-3
 _LOST = 0.005
 # A view whose median error is this many times that of most views may stand in a wrong pose.
 _SUSPECT = 1.6
-_POSE_STEPS = 12
-_POSE_CORNERS = 32_300  # corners at once: they just fill a large piece of `ModelLens`
-
-
-@dataclasses.dataclass(frozen=True)
-class _Found:
-    """A generic lens with poses of all the views it was judged by, and which of these views it explains (F,).
-
-    `cost`, px^2, of these views and of the prior.
-    """
-
-    fit: Fit
-    good: np.ndarray
-    rms_px: float
-    cost: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +66,7 @@ def initial_lens_and_rivals(name: str, model: type[CameraModel], frames: CameraF
     subset = frames.take(spread_views(frames, _MODEL_VIEWS))
     views = compact_views(target.points, subset.pixels, subset.seen)
     with single_threaded_blas():
-        candidates = _generic_candidates(subset, target, views, size)
+        candidates = generic_candidates(subset, target, views, size)
         best = candidates[0]
         logger.debug("%s: generic lenses %s", name, [(c.rms_px, c.fit.parameters[0]) for c in candidates])
         if not best.rms_px < 0.02 * max(size):
@@ -111,243 +88,8 @@ def initial_lens_and_rivals(name: str, model: type[CameraModel], frames: CameraF
     return first
 
 
-def initial_lenses(
-    names: Sequence[str], models: Sequence[type[CameraModel]], cameras: Sequence[CameraFrames], target: Target
-) -> list[CameraModel]:
-    """`initial_lens` for each camera."""
-    return [initial_lens(n, m, f, target) for n, m, f in zip(names, models, cameras, strict=True)]
-
-
-def board_poses(model: CameraModel, frames: CameraFrames, target: Target) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """T_cam_target of every frame through a known lens, the better of the two poses that a flat board allows.
-
-    It takes all corners to tell which is the better one through a narrow lens; a third of them was not enough.
-
-    Returns rotations (F, 3, 3), translations (F, 3) and the root mean square error (F,), px, of each.
-    """
-    lens = ModelLens(model)
-    parameters = np.asarray(model.parameters)[None]
-    far = float(max(frames.detections.image_size))
-    parts = []
-    with single_threaded_blas():
-        generic = generic_of(model, frames.detections.image_size)
-        chunk = max(_POSE_CORNERS // len(target.points), 1)
-        for first in range(0, len(frames.frames), chunk):
-            part = slice(first, first + chunk)
-            views = compact_views(target.points, frames.pixels[part], frames.seen[part])
-            fit = _poses_from_rays(lens, parameters, *generic_lens.unproject(generic, views.pixels), views, far)
-            squared = squared_errors(lens, fit, views, far=1e6)[0]
-            error = np.sqrt(np.sum(squared * views.weight, axis=1) / views.weight.sum(axis=1))
-            parts.append((fit.rotation[0], views.to_target(fit.rotation[0], fit.translation[0]), error))
-    rotation, translation, error = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return rotation, translation, error
-
-
-def generic_of(model: CameraModel, image_size: tuple[int, int]) -> np.ndarray:
-    """The generic lens (1, 6) nearest to a model over its image: good enough to start poses from, with no unprojection
-    of the model's own to compile or to iterate."""
-    far = float(max(image_size))
-    angle = np.deg2rad(np.geomspace(0.2, 125.0, 30))
-    around = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-    rays = np.stack(
-        [
-            np.sin(angle)[:, None] * np.cos(around),
-            np.sin(angle)[:, None] * np.sin(around),
-            np.tile(np.cos(angle)[:, None], (1, len(around))),
-        ],
-        axis=-1,
-    )
-    seen = ModelLens(model).project(
-        np.asarray(model.parameters)[None], rays.reshape(1, 1, -1, 3).swapaxes(-1, -2), False
-    )
-    pixels = seen.pixels[0, 0].T.reshape(*rays.shape[:-1], 2)
-    # Outwards until the lens ends or folds back.
-    radius = np.linalg.norm(pixels - pixels[0].mean(axis=0), axis=-1)
-    outwards = np.diff(radius, axis=0, prepend=0.0) > 0.0
-    inside = np.all((pixels > -0.05 * far) & (pixels < np.array(image_size) + 0.05 * far), axis=-1)
-    real = np.cumprod(outwards & seen.valid[0, 0].reshape(radius.shape), axis=0) * inside
-    views = Views(
-        rays.reshape(1, -1, 3), pixels.reshape(1, -1, 2), real.reshape(1, -1).astype(np.float64), np.zeros(3), 1.0
-    )
-    parameters = generic_lens.hypotheses(pixels[real > 0], image_size, None)
-    count = len(parameters)
-    start = Fit(parameters, np.tile(np.eye(3), (count, 1, 1, 1)), np.zeros((count, 1, 3)), np.full(count, np.inf))
-    prior = generic_lens.weak_prior(image_size, _FIRST_NOISE_PX)
-    fit = fit_lenses(GenericLens(), start, views, steps=20, width=_HUBER_PX, cap=far, prior=prior, hold_poses=True)
-    return fit.parameters[[int(np.argmin(fit.cost))]]
-
-
-def spread_views(frames: CameraFrames, count: int) -> np.ndarray:
-    """Indices of up to `count` views, far apart in the board's place, size and shape in the image (greedy, exact ties
-    by index, so that it is deterministic)."""
-    if len(frames.frames) <= count:
-        return np.arange(len(frames.frames))
-    features = view_features(frames)
-    chosen = [int(np.argmax(frames.seen.sum(axis=1)))]
-    distance = np.full(len(features), np.inf)
-    while len(chosen) < count:
-        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
-        chosen.append(int(np.argmax(distance)))
-    return np.sort(np.array(chosen))
-
-
-def homography_focal(frames: CameraFrames, target: Target) -> float | None:
-    """Focal length (px) that best explains the views' homographies, principal point at the centre, square pixels.
-
-    Zhang 2000, eq. 3 and 4, with the image of the absolute conic reduced to one unknown, 1/f^2. None when the views
-    do not tell (all frontal).
-    """
-    width, height = frames.detections.image_size
-    centre = np.array([(width - 1) / 2.0, (height - 1) / 2.0])
-    board = target.points[:, :2] / np.ptp(target.points[:, :2], axis=0).max()
-    rows, sides = [], []
-    for pixels, seen in zip(frames.pixels, frames.seen, strict=True):
-        homography, _ = cv2.findHomography(board[seen], (pixels[seen] - centre) / width)
-        if homography is None:
-            continue
-        h1, h2 = homography[:, 0] / np.linalg.norm(homography), homography[:, 1] / np.linalg.norm(homography)
-        rows += [h1[0] * h2[0] + h1[1] * h2[1], (h1[0] ** 2 + h1[1] ** 2) - (h2[0] ** 2 + h2[1] ** 2)]
-        sides += [-h1[2] * h2[2], h2[2] ** 2 - h1[2] ** 2]
-    inverse = float(np.dot(rows, sides) / max(np.dot(rows, rows), 1e-300)) if rows else -1.0
-    if inverse <= 0 or not np.isfinite(inverse):
-        return None
-    focal = width / np.sqrt(inverse)
-    return float(focal) if 0.1 * width < focal < 20.0 * width else None
-
-
-# --- poses -----------------------------------------------------------------------------------------------------------
-
-
-def _poses_from_rays(
-    lens: Lens, parameters: np.ndarray, rays: np.ndarray, valid: np.ndarray, views: Views, size: float
-) -> Fit:
-    """Poses of all views for lenses (B, n) from rays (B, F, N, 3), `valid` (B, F, N): the better of both."""
-    weight = views.weight * valid
-    weight = np.where(weight.sum(axis=-1, keepdims=True) >= 6, weight, views.weight)
-    rotation, translation = planar_poses(views.points, rays, weight)
-    fit = Fit(parameters, rotation, translation, np.full(len(parameters), np.inf))
-    fit, cost = fit_poses(lens, fit, views, steps=_POSE_STEPS, width=_HUBER_PX, cap=0.25 * size)
-    return _better_of_mirrored(lens, fit, cost, views, size)[0]
-
-
-def _better_of_mirrored(lens: Lens, fit: Fit, cost: np.ndarray, views: Views, size: float) -> tuple[Fit, np.ndarray]:
-    """The fit with every pose that its mirror image beats replaced, and which ones were (B, F)."""
-    middle = (
-        np.sum(views.points * views.weight[..., None], axis=-2) / np.maximum(views.weight.sum(axis=-1), 1.0)[:, None]
-    )
-    rotation, translation = mirrored_poses(fit.rotation, fit.translation, middle)
-    other = Fit(fit.parameters, rotation, translation, fit.cost)
-    other, other_cost = fit_poses(lens, other, views, steps=_POSE_STEPS, width=_HUBER_PX, cap=0.25 * size, beat=cost)
-    swap = other_cost < cost - 1e-9 * np.abs(cost)
-    merged = Fit(
-        fit.parameters,
-        np.where(swap[..., None, None], other.rotation, fit.rotation),
-        np.where(swap[..., None], other.translation, fit.translation),
-        np.where(swap, other_cost, cost).sum(axis=-1),
-    )
-    return merged, swap
-
-
-# --- the generic lens ------------------------------------------------------------------------------------------------
-
-
-def _generic_candidates(frames: CameraFrames, target: Target, views: Views, size: tuple[int, int]) -> list[_Found]:
-    """Generic lenses with the poses of `views`, the best first."""
-    lens = GenericLens()
-    prior = generic_lens.weak_prior(size, _FIRST_NOISE_PX)
-    far = float(max(size))
-    swept = spread_views(frames, _SWEEP_VIEWS)
-    thin = compact_views(target.points, frames.pixels, frames.seen, _SWEEP_CORNERS)
-    few = thin.take(swept)
-    parameters = generic_lens.hypotheses(few.pixels[few.weight > 0], size, homography_focal(frames.take(swept), target))
-    fit = _poses_from_rays(lens, parameters, *generic_lens.unproject(parameters, few.pixels), few, far)
-    for share, steps in ((0.6, 8), (0.6, 12)):
-        width = _loss_width(lens, fit, few, share, far)
-        fit = fit_lenses(lens, fit, few, steps=steps, width=width, cap=0.25 * far, prior=prior, rtol=1e-3)
-
-    more = thin.take(spread_views(frames, _GENERIC_VIEWS))
-    order = np.argsort(_score(lens, fit, few, far), kind="stable")[: 2 * _MOST_FINALISTS]
-    fit = _poses_from_rays(
-        lens, fit.parameters[order], *generic_lens.unproject(fit.parameters[order], more.pixels), more, far
-    )
-    order = _finalists(_score(lens, fit, more, far), fit.parameters)
-    fit = fit.take(order)
-    fit = fit_lenses(
-        lens, fit, more, steps=30, width=_loss_width(lens, fit, more, 0.6, far), cap=0.25 * far, prior=prior
-    )
-    order = _finalists(_score(lens, fit, more, far), fit.parameters)  # some have met
-    found = [_extended(lens, fit.parameters[b : b + 1], views, size) for b in order]
-    # Where several explain the views equally well, the prior in their costs decides.
-    return sorted(found, key=lambda f: (f.rms_px > 1.5 * min(g.rms_px for g in found), f.cost))
-
-
-def _extended(lens: Lens, parameters: np.ndarray, views: Views, size: tuple[int, int]) -> _Found:
-    """One hypothesis on all views: poses, which views it explains, and the lens refined on these."""
-    far = float(max(size))
-    fit = _poses_from_rays(lens, parameters, *generic_lens.unproject(parameters, views.pixels), views, far)
-    for _ in range(3):
-        good = _explained(lens, fit, views, far)
-        kept = views.with_weight(views.weight * good[:, None])
-        rms_px = _trimmed_rms(lens, fit, kept, far)
-        prior = generic_lens.weak_prior(size, max(rms_px, 0.05))
-        fit = fit_lenses(lens, fit, kept, steps=15, width=_HUBER_PX, cap=0.25 * far, prior=prior)
-        found = _Found(fit, good, rms_px, float(fit.cost[0]))
-        fit, swapped = _swap_mirrored(lens, fit, views, far)
-        if not swapped:
-            break
-    return dataclasses.replace(found, fit=fit, rms_px=_trimmed_rms(lens, fit, kept, far))
-
-
-def _swap_mirrored(lens: Lens, fit: Fit, views: Views, far: float) -> tuple[Fit, bool]:
-    fit, cost = fit_poses(lens, fit, views, steps=3, width=_HUBER_PX, cap=0.25 * far)
-    fit, swap = _better_of_mirrored(lens, fit, cost, views, far)
-    return fit, bool(swap.any())
-
-
-def _loss_width(lens: Lens, fit: Fit, views: Views, share: float, far: float) -> np.ndarray:
-    """Huber widths (B,) at which `share` of the corners count in full; a hypothesis far off is judged by most."""
-    errors = np.sqrt(squared_errors(lens, fit, views, far))[:, views.weight > 0]
-    return np.maximum(np.quantile(errors, share, axis=1), _HUBER_PX)
-
-
-def _score(lens: Lens, fit: Fit, views: Views, far: float) -> np.ndarray:
-    """What a hypothesis misses the corners by (B,), px: the mean over the better four fifths of the views' medians."""
-    errors = np.sqrt(squared_errors(lens, fit, views, far))
-    errors = np.where(views.weight > 0, errors, np.nan)
-    medians = np.sort(np.nanmedian(errors, axis=-1), axis=1)
-    return medians[:, : max(int(np.ceil(0.8 * medians.shape[1])), 1)].mean(axis=1)
-
-
-def _finalists(score: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    """Hypotheses within reach of the best, different ones only."""
-    chosen: list[int] = []
-    for b in np.argsort(score, kind="stable"):
-        if score[b] > 3.0 * score.min() + 0.3:
-            break
-        alike = [np.all(np.abs(parameters[b] - parameters[c])[[0, 4]] < (0.02, 0.05)) for c in chosen]
-        if not any(alike):
-            chosen.append(int(b))
-    return np.array(chosen[:_MOST_FINALISTS])
-
-
-def _explained(lens: Lens, fit: Fit, views: Views, far: float) -> np.ndarray:
-    """Views (F,) whose median error is not far above that of most views."""
-    errors = np.sqrt(squared_errors(lens, fit, views, far)[0])
-    median = np.nanmedian(np.where(views.weight > 0, errors, np.nan), axis=-1)
-    return median <= max(5.0 * float(np.median(median)), 0.003 * far)
-
-
-def _trimmed_rms(lens: Lens, fit: Fit, views: Views, far: float) -> float:
-    """Root mean square error of the better nine tenths of the corners (their lengths), px."""
-    squared = np.sort(squared_errors(lens, fit, views, far)[0][views.weight > 0])
-    return float(np.sqrt(squared[: max(int(0.9 * len(squared)), 1)].mean())) if len(squared) else np.inf
-
-
-# --- the requested model ---------------------------------------------------------------------------------------------
-
-
 def _requested(
-    model: type[CameraModel], candidates: Sequence[_Found], views: Views, size: tuple[int, int]
+    model: type[CameraModel], candidates: Sequence[Found], views: Views, size: tuple[int, int]
 ) -> tuple[FirstLens, float]:
     """The requested model fitted to the generic lens' views, from several starts while it is worse than that lens, with
     its rivals and its error, px."""
@@ -382,7 +124,7 @@ def _with_rivals(fit: Fit, views: Views, start: CameraModel, met: Sequence[Fit],
 
 
 def _starts(
-    model: type[CameraModel], found: _Found, views: Views, size: tuple[int, int]
+    model: type[CameraModel], found: Found, views: Views, size: tuple[int, int]
 ) -> Iterator[Sequence[CameraModel]]:
     """Lenses to start the requested model from: its own for the focal length found, one fitted to the generic lens
     itself, its own for other focal lengths."""
@@ -398,10 +140,10 @@ def _starts(
         yield model.starts(focal * factor, size)
 
 
-def _as_good(fit: Fit, views: Views, start: CameraModel, found: _Found, far: float) -> bool:
+def _as_good(fit: Fit, views: Views, start: CameraModel, found: Found, far: float) -> bool:
     """Whether a fitted model explains the corners as well as the generic lens does, at the image's rim too."""
     lens = ModelLens(start)
-    if _trimmed_rms(lens, fit, views, far) >= 1.3 * found.rms_px + 0.05:
+    if trimmed_rms(lens, fit, views, far) >= 1.3 * found.rms_px + 0.05:
         return False
     seen = views.weight > 0
     limit = max(8.0 * found.rms_px, 0.004 * far) ** 2
@@ -414,9 +156,9 @@ def _sharpened(fit: Fit, views: Views, start: CameraModel, far: float) -> tuple[
     """The fit with a loss as narrow as the corners' own noise, so that wrong corners pull less; and its error, px."""
     lens = ModelLens(start)
     median = float(np.sqrt(np.median(squared_errors(lens, fit, views, far)[0][views.weight > 0])))
-    width = float(np.clip(2.5 * median, 0.1, _HUBER_PX))
+    width = float(np.clip(2.5 * median, 0.1, HUBER_PX))
     fit = fit_lenses(lens, fit, views, steps=20, width=width, cap=far, prior=_model_prior(start))
-    return start.with_parameters(fit.parameters[0]), _trimmed_rms(lens, fit, views, far)
+    return start.with_parameters(fit.parameters[0]), trimmed_rms(lens, fit, views, far)
 
 
 def _model_prior(start: CameraModel) -> tuple[np.ndarray, np.ndarray]:
@@ -449,11 +191,11 @@ def _fit_model(start: CameraModel, generic: Fit, views: Views, far: float) -> Fi
 def _joint_fit(lens: Lens, fit: Fit, views: Views, prior: tuple[np.ndarray, np.ndarray], far: float) -> Fit:
     """Lens and poses together, until no pose is better mirrored."""
     for _ in range(3):
-        best = fit_lenses(lens, fit, views, steps=40, width=_HUBER_PX, cap=far, prior=prior)
-        fit, swapped = _swap_mirrored(lens, best, views, far)
+        best = fit_lenses(lens, fit, views, steps=40, width=HUBER_PX, cap=far, prior=prior)
+        fit, swapped = swap_mirrored(lens, best, views, far)
         if not swapped:
             return best
-    return fit_lenses(lens, fit, views, steps=40, width=_HUBER_PX, cap=far, prior=prior)
+    return fit_lenses(lens, fit, views, steps=40, width=HUBER_PX, cap=far, prior=prior)
 
 
 def _without_suspects(
@@ -470,9 +212,9 @@ def _without_suspects(
     if not suspect.any():
         return None
     trial = fit_lenses(
-        lens, fit, views.with_weight(views.weight * ~suspect[:, None]), steps=20, width=_HUBER_PX, cap=far, prior=prior
+        lens, fit, views.with_weight(views.weight * ~suspect[:, None]), steps=20, width=HUBER_PX, cap=far, prior=prior
     )
-    trial, _ = _swap_mirrored(lens, trial, views, far)
+    trial, _ = swap_mirrored(lens, trial, views, far)
     trial = _joint_fit(lens, trial, views, prior, far)
     return trial if trial.cost[0] < fit.cost[0] * (1.0 - 1e-4) else None
 

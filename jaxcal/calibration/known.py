@@ -9,13 +9,13 @@ import numpy as np
 
 from jaxcal.calibration import solving
 from jaxcal.calibration.assemble import CameraFrames, camera_frames, split_groups, stack_groups, stack_weights
+from jaxcal.calibration.held_back import known_graph, known_target
 from jaxcal.calibration.lens_basis import told_apart
 from jaxcal.calibration.poses import Poses
 from jaxcal.calibration.problem import RigProblem, corner_errors
 from jaxcal.calibration.redundancy import measure_redundancy
 from jaxcal.calibration.state import RigState, SharedLayout, layout_of
 from jaxcal.calibration.target_shape import geometry_of
-from jaxcal.calibration.validation import known_graph, known_target
 from jaxcal.calibration.view_noise import weigh_views
 from jaxcal.calibration.views import associate
 from jaxcal.cameras import CameraModel

@@ -1,6 +1,7 @@
 """From a fit to the `Calibration` that users get."""
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -128,60 +129,22 @@ def calibration_from(
         names, layout, state, covariance, num_intrinsics, with_imu=bool(imus), with_time=with_time
     )
     poses = split_groups(layout, cameras, [np.asarray(part) for part in camera_poses(fit.problem, state)])
-    T_cam_rig = [transform(R, t) for R, t in zip(np.asarray(state.R_cam_rig), np.asarray(state.t_cam_rig), strict=True)]
     seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]
-    results = []
-    for c, (name, frames) in enumerate(zip(names, cameras, strict=True)):
-        if layout.is_rolling(c):
-            check_readout(name, float(np.asarray(state.line_delay)[c]), frames.detections.image_size[1])
-        errors = np.where(seen[c][..., None], fit.errors[c], np.nan)
-        results.append(
-            CameraCalibration(
-                name=name,
-                model=models[c],
-                image_size=frames.detections.image_size,
-                T_cn_cnm1=None if c == 0 else T_cam_rig[c] @ np.linalg.inv(T_cam_rig[c - 1]),
-                T_cam_imu=T_cam_rig[c] if imus else None,
-                timeshift_cam_imu=float(np.asarray(state.shift)[c]) if imus else None,
-                detections=frames.detections,
-                residuals_px=frames.per_corner(errors, np.nan),
-                inlier=frames.per_corner(fit.kept[c], False),
-                corner_sigma_px=fit.sigmas[c],
-                T_cam_target=_per_timestamp(poses[c], frames, usable[c]),
-                line_delay_s=float(np.asarray(state.line_delay)[c]) if layout.is_rolling(c) else None,
-                timeshift_cam_cam0=float(np.asarray(state.shift)[c]) if with_time and not imus else None,
-            )
-        )
     shape = _target_shape(state, layout)
-    open_questions = observability.advice(
-        names,
-        models,
-        layout,
-        covariance,
-        np.asarray(fit.problem.free),
-        cameras,
-        fit.kept,
-        poses,
-        target.points if shape is None else shape.points(target),
-        # Cameras that move along a spline take their pictures each for itself.
-        split_groups(layout, cameras, [np.asarray(data.view) for data in fit.problem.corners])
-        if fit.problem.order == 1
-        else None,
-    )
-    if open_questions.lens_unknown and not bool(fit.result.converged):
-        # The lens is on its way to infinity, say: neither it nor its sigmas mean anything.
-        raise CalibrationError(
-            "failed, because the recording does not determine the lens, and the optimisation finds no end. "
-            + " ".join(open_questions.sentences)
-        )
+    points = target.points if shape is None else shape.points(target)
+    left_open = _left_open(fit, names, models, covariance, cameras, poses, points)
+    results = [
+        _camera_result(fit, c, name, models[c], cameras[c], seen[c], _per_timestamp(poses[c], cameras[c], usable[c]))
+        for c, name in enumerate(names)
+    ]
     lean = lens_sentences(fit, names, models, cameras)
-    sentences = [*open_questions.sentences, *warnings, *lean, *outliers.rejection_warnings(names, seen, fit.kept)]
+    sentences = [*left_open, *warnings, *lean, *outliers.rejection_warnings(names, seen, fit.kept)]
     if not bool(fit.result.converged):
-        reason = ", because the recording leaves parameters open" if open_questions.sentences else ""
+        reason = ", because the recording leaves parameters open" if left_open else ""
         sentences.insert(0, f"The optimisation stopped before it converged{reason}. Do not use this result.")
     history = np.asarray(fit.result.history)
     return Calibration(
-        cameras=tuple(results),
+        cameras=tuple(_placed(results, state, with_imu=bool(imus), with_time=with_time)),
         target=target,
         gravity=np.asarray(state.gravity) if imus else None,
         imu=imus[0] if imus else None,
@@ -195,6 +158,77 @@ def calibration_from(
         converged=bool(fit.result.converged),
         target_shape=shape,
     )
+
+
+def _left_open(
+    fit: RobustFit,
+    names: Sequence[str],
+    models: Sequence[CameraModel],
+    covariance: np.ndarray,
+    cameras: Sequence[CameraFrames],
+    poses: Sequence[np.ndarray],
+    points: np.ndarray,
+) -> tuple[str, ...]:
+    """Sentences on what the recording leaves open; raises CalibrationError when that is a lens, and no optimum was
+    found."""
+    layout = fit.problem.layout
+    views = split_groups(layout, cameras, [np.asarray(data.view) for data in fit.problem.corners])
+    # Cameras that move along a spline take their pictures each for itself.
+    of_rig = views if fit.problem.order == 1 else None
+    free = np.asarray(fit.problem.free)
+    found = observability.advice(names, models, layout, covariance, free, cameras, fit.kept, poses, points, of_rig)
+    if found.lens_unknown and not bool(fit.result.converged):
+        # The lens is on its way to infinity, say: neither it nor its sigmas mean anything.
+        raise CalibrationError(
+            "failed, because the recording does not determine the lens, and the optimisation finds no end. "
+            + " ".join(found.sentences)
+        )
+    return found.sentences
+
+
+def _camera_result(
+    fit: RobustFit,
+    c: int,
+    name: str,
+    model: CameraModel,
+    frames: CameraFrames,
+    seen: np.ndarray,
+    T_cam_target: np.ndarray,
+) -> CameraCalibration:
+    """A camera by itself: lens, corners, line delay; not yet its place in the rig."""
+    delay = None
+    if fit.problem.layout.is_rolling(c):
+        delay = float(np.asarray(fit.state.line_delay)[c])
+        check_readout(name, delay, frames.detections.image_size[1])
+    return CameraCalibration(
+        name=name,
+        model=model,
+        image_size=frames.detections.image_size,
+        T_cn_cnm1=None,
+        T_cam_imu=None,
+        timeshift_cam_imu=None,
+        detections=frames.detections,
+        residuals_px=frames.per_corner(np.where(seen[..., None], fit.errors[c], np.nan), np.nan),
+        inlier=frames.per_corner(fit.kept[c], False),
+        corner_sigma_px=fit.sigmas[c],
+        T_cam_target=T_cam_target,
+        line_delay_s=delay,
+    )
+
+
+def _placed(
+    cameras: Sequence[CameraCalibration], state: RigState, *, with_imu: bool, with_time: bool
+) -> Iterator[CameraCalibration]:
+    """The cameras with their places in the rig and, where they were estimated, their time shifts."""
+    T_cam_rig = [transform(R, t) for R, t in zip(np.asarray(state.R_cam_rig), np.asarray(state.t_cam_rig), strict=True)]
+    for c, (camera, shift) in enumerate(zip(cameras, np.asarray(state.shift), strict=True)):
+        yield dataclasses.replace(
+            camera,
+            T_cn_cnm1=None if c == 0 else T_cam_rig[c] @ np.linalg.inv(T_cam_rig[c - 1]),
+            T_cam_imu=T_cam_rig[c] if with_imu else None,
+            timeshift_cam_imu=float(shift) if with_imu else None,
+            timeshift_cam_cam0=float(shift) if with_time and not with_imu else None,
+        )
 
 
 def _per_timestamp(poses: np.ndarray, frames: CameraFrames, usable: np.ndarray) -> np.ndarray:

@@ -73,24 +73,14 @@ def robust_fit(
     (F,) are the frames that may take part; `pose_parameters[c]` how many parameters of the trajectory a camera's
     corners pay for, for the degrees of freedom.
     """
-    layout = problem.layout
     seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]
-    kept, sigmas = seen, list(first_sigmas)
-    noise = all_alike([len(s) for s in seen])
-    places = np.asarray(problem.geometry.across)
-    redundancy = [Redundancy(np.ones(len(s)), 1.0, 0.0) for s in seen]
+    parameters = estimated_parameters(problem, pose_parameters)
+    known = _first_guess(seen, first_sigmas)
     result: SolveResult | None = None
     errors: list[np.ndarray] = []
-    parameters = estimated_parameters(problem, pose_parameters)
     for stage in range(ROUNDS):
         progress("optimise", stage, ROUNDS)
-        width = _HUBER_SIGMAS if stage < 3 else np.inf
-        problem = _with_weights(problem, cameras, kept, sigmas, redundancy, noise, width)
-        if reweigh is not None and result is not None:
-            problem = reweigh(problem, state, stage)
-        if result is not None:
-            basis = told_apart(problem.basis, result.equations, np.asarray(problem.free), layout)
-            problem = eqx.tree_at(lambda p: p.basis, problem, basis, is_leaf=lambda leaf: leaf is None)
+        problem = _adapted(problem, cameras, known, stage, result, reweigh)
         last = stage == ROUNDS - 1
         result = solve(
             problem,
@@ -101,41 +91,92 @@ def robust_fit(
         )
         # With the noise known and the lens near its optimum: before views and corners are judged by their errors.
         state = turn_mirrored(problem, result.state, max_steps) if stage == 1 else result.state
-        errors = split_groups(layout, cameras, [np.asarray(e) for e in corner_errors(problem, state)])
-        # In units of an ordinary corner: what a detector knows to be vague may err more.
-        scaled = _in_usual_units(errors, cameras, noise)
         if not np.isfinite(float(result.equations.cost)):
             raise CalibrationError(
                 "the optimisation diverged: the residuals are not finite. Check for frames with a wrong board, and "
                 "that the camera models suit the lenses."
             )
-        if stage < 3:
-            sigmas = [outliers.robust_sigma(e, s) for e, s in zip(scaled, kept, strict=True)]
-        if stage == 1:
-            redundancy = [measure_redundancy(*parts) for parts in zip(cameras, scaled, seen, sigmas, strict=True)]
-        if stage == 2:
-            kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(scaled, seen, sigmas, strict=True)]
-            weighed = [weigh_views(*p, places, r) for *p, r in zip(cameras, scaled, kept, redundancy, strict=True)]
-            redundancy, noise = [w for w, _ in weighed], [n for _, n in weighed]
-            scaled = [e / n[:, None, None] for e, n in zip(scaled, noise, strict=True)]
-            sigmas = [outliers.robust_sigma(e, k) for e, k in zip(scaled, kept, strict=True)]
-        if stage >= 3:
-            sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(scaled, kept, parameters, strict=True)]
-        if stage == 3:
-            # Good corners that outliers in the same view had pulled away are taken back.
-            kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(scaled, seen, sigmas, strict=True)]
+        errors = split_groups(problem.layout, cameras, [np.asarray(e) for e in corner_errors(problem, state)])
+        known = _learnt(known, stage, errors, cameras, seen, parameters, np.asarray(problem.geometry.across))
         logger.info(
             "round %d: cost %.6g after %d iterations, corner noise %s px",
             stage,
             float(result.equations.cost),
             int(result.iterations),
-            ", ".join(f"{sigma:.3f}" for sigma in sigmas),
+            ", ".join(f"{sigma:.3f}" for sigma in known.sigmas),
         )
     progress("optimise", ROUNDS, ROUNDS)
     assert result is not None
     usual = _in_usual_units(errors, cameras, all_alike([len(s) for s in seen]))
-    sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(usual, kept, parameters, strict=True)]
-    return RobustFit(problem, result, errors, kept, sigmas, redundancy)
+    sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(usual, known.kept, parameters, strict=True)]
+    return RobustFit(problem, result, errors, known.kept, sigmas, known.redundancy)
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What the rounds have learnt so far, per camera: inliers (F, N), corner noise px, what views add, and how much
+    noisier than the others each view is (F,)."""
+
+    kept: list[np.ndarray]
+    sigmas: list[float]
+    redundancy: list[Redundancy]
+    noise: list[np.ndarray]
+
+
+def _first_guess(seen: Sequence[np.ndarray], sigmas: Sequence[float]) -> _Known:
+    """Every corner is a good one, every view like any other."""
+    alike = [Redundancy(np.ones(len(s)), 1.0, 0.0) for s in seen]
+    return _Known(list(seen), list(sigmas), alike, all_alike([len(s) for s in seen]))
+
+
+def _adapted(
+    problem: RigProblem,
+    cameras: Sequence[CameraFrames],
+    known: _Known,
+    stage: int,
+    result: SolveResult | None,
+    reweigh: Reweigh | None,
+) -> RigProblem:
+    """The problem of a round: weights from what is known, and what the last round's `result` says of the rest."""
+    problem = _with_weights(problem, cameras, known, _HUBER_SIGMAS if stage < 3 else np.inf)
+    if result is None:
+        return problem
+    if reweigh is not None:
+        problem = reweigh(problem, result.state, stage)
+    basis = told_apart(problem.basis, result.equations, np.asarray(problem.free), problem.layout)
+    return eqx.tree_at(lambda p: p.basis, problem, basis, is_leaf=lambda leaf: leaf is None)
+
+
+def _learnt(
+    known: _Known,
+    stage: int,
+    errors: Sequence[np.ndarray],
+    cameras: Sequence[CameraFrames],
+    seen: Sequence[np.ndarray],
+    parameters: Sequence[float],
+    places: np.ndarray,
+) -> _Known:
+    """What is known after a round, from the errors (F, N, 2) px of its solution; `places` (N, 2) on the board."""
+    # In units of an ordinary corner: what a detector knows to be vague may err more.
+    scaled = _in_usual_units(errors, cameras, known.noise)
+    kept, sigmas, redundancy, noise = known.kept, known.sigmas, known.redundancy, known.noise
+    if stage < 3:
+        sigmas = [outliers.robust_sigma(e, s) for e, s in zip(scaled, kept, strict=True)]
+    if stage == 1:
+        redundancy = [measure_redundancy(*parts) for parts in zip(cameras, scaled, seen, sigmas, strict=True)]
+    if stage == 2:
+        kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(scaled, seen, sigmas, strict=True)]
+        views = zip(cameras, scaled, kept, redundancy, strict=True)
+        weighed = [weigh_views(frames, e, k, places, r) for frames, e, k, r in views]
+        redundancy, noise = [w for w, _ in weighed], [n for _, n in weighed]
+        scaled = [e / n[:, None, None] for e, n in zip(scaled, noise, strict=True)]
+        sigmas = [outliers.robust_sigma(e, k) for e, k in zip(scaled, kept, strict=True)]
+    if stage >= 3:
+        sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(scaled, kept, parameters, strict=True)]
+    if stage == 3:
+        # Good corners that outliers in the same view had pulled away are taken back.
+        kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(scaled, seen, sigmas, strict=True)]
+    return _Known(kept, sigmas, redundancy, noise)
 
 
 def estimated_parameters(problem: RigProblem, pose_parameters: Sequence[float]) -> list[float]:
@@ -158,18 +199,11 @@ def _in_usual_units(
     ]
 
 
-def _with_weights(
-    problem: RigProblem,
-    cameras: Sequence[CameraFrames],
-    kept: Sequence[np.ndarray],
-    sigmas: Sequence[float],
-    redundancy: Sequence[Redundancy],
-    noise: Sequence[np.ndarray],
-    loss_width: float,
-) -> RigProblem:
+def _with_weights(problem: RigProblem, cameras: Sequence[CameraFrames], known: _Known, loss_width: float) -> RigProblem:
+    parts = zip(known.kept, known.sigmas, known.redundancy, known.noise, cameras, strict=True)
     weights = [
-        k * (r.weights / n**2)[:, None] * (frames.precision / sigma) ** 2
-        for k, sigma, r, n, frames in zip(kept, sigmas, redundancy, noise, cameras, strict=True)
+        kept * (r.weights / noise**2)[:, None] * (frames.precision / sigma) ** 2
+        for kept, sigma, r, noise, frames in parts
     ]
     return eqx.tree_at(
         lambda p: [*[data.weight for data in p.corners], p.loss_width],

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxcal.calibration.assemble import camera_frames
-from jaxcal.calibration.initial_lens import board_poses
-from jaxcal.calibration.validation import held_back_residuals
+from jaxcal.calibration.held_back import held_back_residuals
+from jaxcal.calibration.lens_poses import board_poses
 from jaxcal.calibration.views import associate, split_boards
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import Detections

@@ -8,7 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal import CalibrationError, CameraModel, Checkerboard, Detections, camera_model
 from jaxcal.calibration.assemble import CameraFrames, camera_frames
-from jaxcal.calibration.initial_lens import board_poses, initial_lens, spread_views
+from jaxcal.calibration.generic_search import spread_views
+from jaxcal.calibration.initial_lens import initial_lens
+from jaxcal.calibration.lens_poses import board_poses
 
 SIZE = (640, 480)
 BOARD = Checkerboard(6, 8, 0.05)

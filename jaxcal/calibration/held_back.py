@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxcal.calibration import rig_graph, solving
 from jaxcal.calibration.assemble import camera_frames, split_groups
-from jaxcal.calibration.initial_lens import board_poses
+from jaxcal.calibration.lens_poses import board_poses
 from jaxcal.calibration.problem import corner_errors
 from jaxcal.calibration.rig_graph import RigGraph, Sightings
 from jaxcal.calibration.state import TargetState, layout_of
