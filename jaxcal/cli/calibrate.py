@@ -79,6 +79,9 @@ def calibrate(
     which holds everything. Reconstructed frames and corners are kept in .jaxcal/ beside RIG.yaml: a run that was
     broken off, however it was, goes on where it stopped.
     """
+    from jaxcal.recording import load_rig
+
+    described = load_rig(rig)  # a mistake in it is said at once, before the heavy imports
     from jaxcal.cli.outcome import show_calibration
     from jaxcal.cli.progress_bars import ProgressBars
     from jaxcal.pipeline import PipelineSettings, run_pipeline
@@ -91,7 +94,7 @@ def calibrate(
     if window_ms is not None:
         settings = replace(settings, window_ms=window_ms)
     with ProgressBars() as bars:
-        calibration = run_pipeline(rig, output, settings=settings, workers=workers, progress=bars)
+        calibration = run_pipeline(described, output, settings=settings, workers=workers, progress=bars)
     if rerun is not None:
         write_rerun(calibration, rerun)
     truth = rig.parent / "ground_truth.yaml"

@@ -35,7 +35,7 @@ def show_calibration(
 ) -> int:
     """Print a calibration that was written to `output`; gives the exit code.
 
-    First the parameters, or their comparison with `ground_truth` where that file exists; then warnings, what a
+    First the parameters, or their comparison with `ground_truth` where that file exists, and warnings; then what a
     `cross_validation` found, the verdict in words, and where the files are: report.html, and `files` by what they are.
     """
     from jaxcal.results import judge, results_text
@@ -56,10 +56,10 @@ def show_calibration(
         click.echo(comparison_table(compare_with_ground_truth(calibration, ground_truth)))
         for camera in calibration.cameras:
             click.echo(f"{camera.name}: reprojection error {camera.reprojection_rms_px:.3f} px rms")
+        for warning in calibration.warnings:
+            click.echo(f"warning: {warning}")
     else:
-        click.echo(results_text(calibration))
-    for warning in calibration.warnings:
-        click.echo(f"warning: {warning}")
+        click.echo(results_text(calibration))  # which ends in the warnings
     if cross_validation is not None:
         click.echo(f"cross-validation: {cross_validation.headline}")
     click.echo(f"verdict: {verdict.headline}")

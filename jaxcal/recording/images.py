@@ -3,6 +3,7 @@
 import csv
 import glob
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,12 +19,13 @@ from jaxcal.recording.yaml_files import located
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
 _EXPECTED = (
-    "Expected an EuRoC/ASL folder (data.csv beside data/), image files named by their time in ns, or a bag: "
-    "FILE.bag:/cam0/image_raw, or a pattern of file names with a number in each: left*.png."
+    "Expected an EuRoC/ASL folder (data.csv beside data/), image files named by their time in ns or with a number in "
+    "each name, a pattern of such names (left*.png), or a bag: FILE.bag:/cam0/image_raw."
 )
 # Images that carry no time but a number are taken this far apart.
 _STEP_NS = 100_000_000
 _LEAST_TIME_NS = 10**12  # a number as large is a time
+_LEAST_NAME_NS = 10**6  # where names are numbers and nothing else, one as large is: recordings may begin at zero
 
 
 @dataclass(frozen=True)
@@ -85,10 +87,10 @@ def load_frames(folder: str | Path) -> Frames:
 
     `folder` is an EuRoC/ASL camera folder (`data.csv` with lines 'time in ns, file name', and `data/`), a bare folder
     of images named `<time in ns>.png`, or a bag of ROS 1, ROS 2 or mcap: `FILE.bag:/cam0/image_raw`, where the topic
-    may be left out if only one has images. Or it is a pattern of file names, `calib/left*.jpg`: the last number in each
-    name stands for its time, in nanoseconds where it is as large as that, else in steps of 0.1 s. Raises
-    CalibrationError when there are no images, a file that data.csv names is missing, a name is no time, or times do not
-    increase.
+    may be left out if only one has images. Or it is a folder of numbered images (`left01.jpg`), or a pattern of their
+    names, `calib/left*.jpg`: the last number in each name stands for its time, in nanoseconds where it is as large as
+    that, else in steps of 0.1 s. Raises CalibrationError when there are no images, a file that data.csv names is
+    missing, a name has no number, or times do not increase.
     """
     if is_pattern(folder):
         return _numbered(str(folder))
@@ -113,22 +115,28 @@ def is_pattern(path: str | Path) -> bool:
 
 
 def _numbered(pattern: str) -> Frames:
+    found = sorted(Path(name) for name in glob.glob(pattern))
+    if not found:
+        raise CalibrationError(f"{pattern}: no such images. Quote the pattern, and check the folder.")
+    times, paths = _by_number(found, "Give a narrower pattern.")
+    height, width = read_grey(paths[0]).shape
+    return Frames(np.array(times, np.int64), ImageFiles(tuple(paths), (width, height)), (width, height))
+
+
+def _by_number(found: Sequence[Path], narrower: str) -> tuple[list[int], list[Path]]:
+    """Times (ns) by the last number in each name, and the files in their order."""
     numbered: dict[int, Path] = {}
-    for path in sorted(Path(found) for found in glob.glob(pattern)):
+    for path in found:
         digits = re.findall(r"\d+", path.stem)
         if not digits:
             raise CalibrationError(f"{path}: no number in the name; images of one moment are matched by it. Rename it.")
         number = int(digits[-1])
         if number in numbered:
-            raise CalibrationError(f"{path}: has the number of {numbered[number]}. Give a narrower pattern.")
+            raise CalibrationError(f"{path}: has the number of {numbered[number]}. {narrower}")
         numbered[number] = path
-    if not numbered:
-        raise CalibrationError(f"{pattern}: no such images. Quote the pattern, and check the folder.")
     numbers = sorted(numbered)
-    height, width = read_grey(numbered[numbers[0]]).shape
-    paths = tuple(numbered[number] for number in numbers)
     step = 1 if numbers[-1] >= _LEAST_TIME_NS else _STEP_NS
-    return Frames(np.array(numbers, np.int64) * step, ImageFiles(paths, (width, height)), (width, height))
+    return [number * step for number in numbers], [numbered[number] for number in numbers]
 
 
 def listed_images(listing: Path) -> tuple[list[int], list[Path]]:
@@ -162,10 +170,10 @@ def _named_by_time(folder: Path) -> tuple[list[int], list[Path]]:
     data = folder / "data"
     source = data if data.is_dir() else folder
     found = [path for path in source.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
-    for path in sorted(found):
-        if not path.stem.isdigit():
-            raise CalibrationError(f"{path}: the name is not a time in whole nanoseconds. {_EXPECTED}")
     if not found:
         raise CalibrationError(f"{folder}: there are no images in this folder. {_EXPECTED}")
-    found.sort(key=lambda path: int(path.stem))
-    return [int(path.stem) for path in found], found
+    times = {path: int(path.stem) for path in found if path.stem.isdigit()}
+    if len(times) < len(found) or max(times.values()) < _LEAST_NAME_NS:
+        return _by_number(sorted(found), f"Give a pattern that names the images of one camera: {source}/left*.png.")
+    found.sort(key=lambda path: times[path])
+    return [times[path] for path in found], found

@@ -14,6 +14,7 @@ import yaml
 from click.testing import CliRunner, Result
 
 import jaxcal.pipeline
+import jaxcal.recording
 from jaxcal import CalibrationError, Checkerboard, Detections, load_calibration
 from jaxcal.cli import main
 from jaxcal.results import Calibration
@@ -159,6 +160,7 @@ def test_impossible_input_is_one_line_and_exit_code_1(monkeypatch: pytest.Monkey
     def fail(*_: Any, **__: Any) -> None:
         raise CalibrationError("cam0: too dark.")
 
+    monkeypatch.setattr(jaxcal.recording, "load_rig", lambda path: path)
     monkeypatch.setattr(jaxcal.pipeline, "run_pipeline", fail)
     result = run(tmp_path / "rig.yaml", "--json")
     assert (result.exit_code, result.stdout, result.stderr) == (1, "", "error: cam0: too dark.\n")
@@ -193,6 +195,7 @@ def test_the_verdict_is_the_exit_code(
     calibration = Calibration(
         (camera,), BOARD, None, None, (("cam0.intrinsics", 4), ("cam0.distortion", 4)), 1e-8 * np.eye(8), np.ones(1)
     )
+    monkeypatch.setattr(jaxcal.recording, "load_rig", lambda path: path)
     monkeypatch.setattr(jaxcal.pipeline, "run_pipeline", lambda *_, **__: calibration)
     result = run("rig.yaml", "--output", tmp_path, "--json")
     assert result.exit_code == code

@@ -37,10 +37,10 @@ def test_euroc_folder(tmp_path: Path) -> None:
 
 
 def test_bare_folder_is_sorted_by_time_not_by_name(tmp_path: Path) -> None:
-    for k, t in enumerate([900, 1_000, 20_000]):
+    for k, t in enumerate([9_000_000, 10_000_000, 200_000_000]):
         cv2.imwrite(str(tmp_path / f"{t}.png"), image(k))
     frames = load_frames(tmp_path)
-    assert frames.timestamps_ns.tolist() == [900, 1_000, 20_000]
+    assert frames.timestamps_ns.tolist() == [9_000_000, 10_000_000, 200_000_000]
     assert frames.images[2][0, 0] == 20
 
 
@@ -67,9 +67,27 @@ def test_folders_that_are_no_recording(tmp_path: Path) -> None:
         load_frames(tmp_path / "absent")
     with pytest.raises(CalibrationError, match="no images in this folder"):
         load_frames(tmp_path)
-    cv2.imwrite(str(tmp_path / "left01.png"), image(1))
-    with pytest.raises(CalibrationError, match=r"left01.png: the name is not a time"):
+    cv2.imwrite(str(tmp_path / "left.png"), image(1))
+    with pytest.raises(CalibrationError, match=r"left.png: no number in the name"):
         load_frames(tmp_path)
+
+
+@pytest.mark.parametrize("names", [["1.png", "02.png", "10.png"], ["b_1.png", "a_2.png", "a_10.png"]])
+def test_numbered_images_in_a_folder_are_a_tenth_of_a_second_apart(tmp_path: Path, names: list[str]) -> None:
+    for grey, name in enumerate(names):
+        cv2.imwrite(str(tmp_path / name), np.full((4, 6), grey, np.uint8))
+    frames = load_frames(tmp_path)
+    np.testing.assert_array_equal(frames.timestamps_ns, [100_000_000, 200_000_000, 1_000_000_000])
+    assert [int(frames.images[k][0, 0]) for k in range(3)] == [0, 1, 2]
+    cv2.imwrite(str(tmp_path / "c_2.png"), image(1))
+    with pytest.raises(CalibrationError, match=r"has the number of .*2.png. Give a pattern that names the images"):
+        load_frames(tmp_path)
+
+
+def test_names_that_are_times_may_begin_at_zero(tmp_path: Path) -> None:
+    for time in (0, 33_000_000, 66_000_000):
+        cv2.imwrite(str(tmp_path / f"{time}.png"), image(1))
+    np.testing.assert_array_equal(load_frames(tmp_path).timestamps_ns, [0, 33_000_000, 66_000_000])
 
 
 def test_listing_errors(tmp_path: Path) -> None:
