@@ -14,7 +14,7 @@ from jaxcal.cameras import CameraModel
 from jaxcal.trajectory import PoseSpline, basis_matrix, increments, rotation_at, so3, weights
 
 # Frames are reduced in batches of this many: large enough to vectorise, small enough to stay in the cache.
-FRAME_BATCH = 16
+FRAME_BATCH = 8
 # A point that every lens sees, off the axis, where a careless model may have no derivative (m).
 _HARMLESS = (0.1, 0.1, 1.0)
 
@@ -258,20 +258,22 @@ def _reduce_corners(
         pixel, pull = jax.vjp(project, camera_point, lens)
         return pixel, pull(jnp.array([1.0, 0.0])), pull(jnp.array([0.0, 1.0]))
 
-    projected, *pulled = jax.vmap(corner, in_axes=1, out_axes=-1)(camera_points)
+    # Barriers keep the compiler from computing a projection anew for every row that is made of it.
+    projected, *pulled = jax.lax.optimization_barrier(jax.vmap(corner, in_axes=1, out_axes=-1)(camera_points))
     residual = projected - pixels
     rho, robust_weight = loss(weight * jnp.sum(residual**2, axis=0))
-    root = jnp.sqrt(jnp.where(seen, weight * robust_weight, 0.0))
+    root = jax.lax.optimization_barrier(jnp.sqrt(jnp.where(seen, weight * robust_weight, 0.0)))
     x, y, z = rotated
-    both = []
+    gram = jnp.zeros(())
     for (by_point, by_lens), error in zip(pulled, residual, strict=True):
         a, b, c = by_point
         by_lens = by_lens if along is None else along.T @ by_lens
         by_rotation = jnp.stack([y * c - z * b, z * a - x * c, x * b - y * a])  # -by_point hat(rotated)
         by_shape = jnp.einsum("jn,tjn->tn", R_cam_target.T @ by_point, by_target)
-        both.append(jnp.concatenate([by_rotation, by_point, by_lens, by_shape, error[None]]))
-    rows = jnp.concatenate(both, axis=1) * jnp.tile(root, 2)
-    return rows @ rows.T, 0.5 * jnp.sum(jnp.where(seen, rho, 0.0))
+        parts = [part * root for part in (by_rotation, by_point, by_lens, by_shape, error[None])]
+        rows = jnp.concatenate(jax.lax.optimization_barrier(parts))
+        gram = gram + rows @ rows.T
+    return gram, 0.5 * jnp.sum(jnp.where(seen, rho, 0.0))
 
 
 def _lift(
