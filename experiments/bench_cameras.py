@@ -4,8 +4,9 @@
     python experiments/bench_cameras.py --only mono whole
 
 Each part solves the same corners from the same start to the same optimum, and says what that optimum cost. 'cold' is
-the first call of a program in a process, compilation included; 'warm' the best of five later ones; CPU seconds are of
-all threads. Ratios are of warm wall time, theirs over ours. Ceres needs `pip install jaxcal[bench]`.
+the first call of a program in a process, compilation included; 'warm' the best of five later ones (of twenty, in turn,
+for one camera); CPU seconds are of all threads. Ratios are of warm wall time, theirs over ours. Ceres needs
+`pip install jaxcal[bench]`.
 
 - mono: one camera, 40 and 200 views of 144 corners, against cv2.calibrateCamera
 - rig: four cameras, 200 and 1000 views, against Ceres, and (200) against OpenCV 5's cv2.calibrateMultiview
@@ -21,7 +22,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,7 @@ TRUTH = np.array([458.0, 457.0, 367.0, 248.0, -0.28, 0.074, 0.0002, 0.00001])
 START = np.array([430.0, 430.0, 375.5, 239.5, 0.0, 0.0, 0.0, 0.0])
 NOISE_PX = 0.2
 REPEATS = 5
+MONO_REPEATS = 20  # of a hundredth of a second each
 BATCH = 64
 FOLDER = os.path.dirname(os.path.abspath(__file__))
 PARTS = ("mono", "rig", "batch", "whole", "memory")
@@ -115,16 +117,23 @@ def make_case(views: int, cameras: int, seed: int = 0) -> Case:
 
 def timed(call: Callable[[], Any], repeats: int = REPEATS) -> tuple[Timing, Any]:
     """Run `call` once cold and `repeats` times warm."""
-    start = time.perf_counter()
-    result = call()
-    cold = time.perf_counter() - start
-    runs = []
+    return timed_in_turn([call], repeats)[0]
+
+
+def timed_in_turn(calls: Sequence[Callable[[], Any]], repeats: int = REPEATS) -> list[tuple[Timing, Any]]:
+    """Run each call once cold and `repeats` times warm, in turn: a machine that is slower for a while is so for all."""
+    cold, results = [], []
+    for call in calls:
+        start = time.perf_counter()
+        results.append(call())
+        cold.append(time.perf_counter() - start)
+    runs: list[list[tuple[float, float]]] = [[] for _ in calls]
     for _ in range(repeats):
-        wall, cpu = time.perf_counter(), time.process_time()
-        result = call()
-        runs.append((time.perf_counter() - wall, time.process_time() - cpu))
-    warm, cpu = min(runs)
-    return Timing(cold, warm, cpu), result
+        for place, call in enumerate(calls):
+            wall, cpu = time.perf_counter(), time.process_time()
+            results[place] = call()
+            runs[place].append((time.perf_counter() - wall, time.process_time() - cpu))
+    return [(Timing(first, *min(own)), result) for first, own, result in zip(cold, runs, results, strict=True)]
 
 
 def report(what: str, timing: Timing, cost: float, ratio: float | None = None, more: str = "") -> None:
@@ -159,9 +168,14 @@ def calibrate_opencv(points: list[np.ndarray], pixels: list[np.ndarray]) -> floa
 def bench_mono() -> None:
     for views in (40, 200):
         case = make_case(views, 1)
-        ours, result = timed(lambda case=case: solve(case.problem, case.state))
         inputs = opencv_inputs(case.cameras[0])
-        theirs, cost = timed(lambda inputs=inputs: calibrate_opencv(*inputs))
+        (ours, result), (theirs, cost) = timed_in_turn(
+            [
+                lambda case=case: solve(case.problem, case.state),
+                lambda inputs=inputs: calibrate_opencv(*inputs),
+            ],
+            MONO_REPEATS,
+        )
         steps = f"{int(result.iterations)} iterations"
         report(f"jaxcal, {views} views", ours, float(result.equations.cost), theirs.warm / ours.warm, steps)
         report(f"cv2.calibrateCamera, {views} views", theirs, cost)
