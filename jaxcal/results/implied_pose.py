@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.optimize import least_squares
 
 from jaxcal.cameras import CameraModel
 from jaxcal.results.rays import rays_through
@@ -81,6 +80,7 @@ def implied_difference(
 
 def _fit(at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], free: np.ndarray) -> np.ndarray:
     """The move (6,) of least squares, then of least softened squares, over the entries that are `free`."""
+    from scipy.optimize import least_squares  # 0.2 s, which results that nobody compares can do without
 
     def whole(part: np.ndarray) -> np.ndarray:
         vector = np.zeros(6)

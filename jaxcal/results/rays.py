@@ -1,5 +1,7 @@
 """Rays of a lens through pixels, by one compiled program for all that ask for them."""
 
+from dataclasses import dataclass
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,16 +16,33 @@ _MISSED_PX = 1e-3
 _STEP = 2560
 
 
+@dataclass(frozen=True)
+class Look:
+    """Unit `rays` (K, 3) of a lens through pixels, and whether each is its pixel's, in the lens's domain, `valid` (K,);
+    and the lens near its axis, as `CameraModel.paraxial`: pixels per radian (2, 2), and the axis' pixel (2,)."""
+
+    rays: np.ndarray
+    valid: np.ndarray
+    scale: np.ndarray
+    centre: np.ndarray
+
+
 def rays_through(model: CameraModel, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit rays (K, 3) of a lens through pixels (K, 2), and whether each is its pixel's, in the lens's domain (K,)."""
+    look = look_through(model, pixels)
+    return look.rays, look.valid
+
+
+def look_through(model: CameraModel, pixels: np.ndarray) -> Look:
+    """How a lens looks through pixels (K, 2)."""
     count = -(-max(len(pixels), 1) // _STEP) * _STEP
     padded = np.pad(np.asarray(pixels, dtype=np.float64), ((0, count - len(pixels)), (0, 0)), mode="edge")
-    rays, valid = _rays_through(model, jax.device_put(padded))
-    return np.asarray(rays)[: len(pixels)], np.asarray(valid)[: len(pixels)]
+    rays, valid, scale, centre = (np.asarray(part) for part in _look_through(model, jax.device_put(padded)))
+    return Look(rays[: len(pixels)], valid[: len(pixels)], scale, centre)
 
 
 @eqx.filter_jit
-def _rays_through(model: CameraModel, pixels: Float[Array, "K 2"]) -> tuple[Array, Array]:
+def _look_through(model: CameraModel, pixels: Float[Array, "K 2"]) -> tuple[Array, Array, Array, Array]:
     rays = model.unproject(pixels)
     missed = jnp.linalg.norm(model.project(rays) - pixels, axis=-1)
-    return rays, jax.vmap(model.is_valid)(rays) & (missed < _MISSED_PX)
+    return rays, jax.vmap(model.is_valid)(rays) & (missed < _MISSED_PX), *model.paraxial()

@@ -1,14 +1,11 @@
 """The figure of a lens: the angle at which each pixel looks, and where a straight lens would have put it."""
 
-import equinox as eqx
 import numpy as np
-from jaxtyping import Array
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
-from jaxcal.cameras import CameraModel
 from jaxcal.results.calibration import CameraCalibration
-from jaxcal.results.rays import rays_through
+from jaxcal.results.rays import look_through
 from jaxcal.results.report.drawing import ACCENT, INK, MUTED, Picture, image_panel, note, nothing_to_show, to_svg
 
 _GRID = (48, 36)
@@ -60,17 +57,11 @@ def _looked(camera: CameraCalibration) -> tuple[np.ndarray, np.ndarray, np.ndarr
     width, height = camera.image_size
     nx, ny = _GRID
     pixels = np.stack(np.meshgrid(np.linspace(0, width - 1.0, nx), np.linspace(0, height - 1.0, ny)), axis=-1)
-    rays, valid = rays_through(camera.model, pixels.reshape(-1, 2))
-    valid = valid & np.isfinite(rays).all(axis=1)
+    look = look_through(camera.model, pixels.reshape(-1, 2))
+    rays, valid = look.rays, look.valid & np.isfinite(look.rays).all(axis=1)
     angle = np.where(valid, np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]), np.nan)
-    scale, centre = (np.asarray(part) for part in _paraxial(camera.model))
     ahead = np.where((rays[:, 2] > 1e-3)[:, None], rays[:, :2] / np.maximum(rays[:, 2:], 1e-3), np.nan)
-    return pixels, angle.reshape(ny, nx), (ahead @ scale.T + centre).reshape(ny, nx, 2)
-
-
-@eqx.filter_jit
-def _paraxial(model: CameraModel) -> tuple[Array, Array]:
-    return model.paraxial()
+    return pixels, angle.reshape(ny, nx), (ahead @ look.scale.T + look.centre).reshape(ny, nx, 2)
 
 
 def _draw_angles(axes: Axes, pixels: np.ndarray, angle: np.ndarray) -> None:
