@@ -71,8 +71,8 @@ def calibrate_cameras(ctx: click.Context, sources: tuple[str, ...], out: Path | 
 
     \b
     A CAMERA is one of
-        a folder of images        EuRoC/ASL (data.csv and data/), or <time in ns>.png
-        a pattern of file names   'left*.jpg', quoted; the number in each name stands for its time
+        a folder of images        EuRoC/ASL (data.csv and data/), <time in ns>.png, or numbered: left01.jpg
+        a pattern of file names   'both/left*.jpg', quoted, where a folder holds several cameras' images
         a topic of a bag          drive.bag:/cam0/image_raw
         corners.npz               what jaxcal detected, or a corner table: corners.npz:cam0 takes its columns cam0_*
 
