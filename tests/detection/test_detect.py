@@ -20,6 +20,7 @@ from jaxcal.targets import Target
 BOARD = Checkerboard(rows=4, cols=5, spacing=0.06)
 SIZE = (160, 120)
 NUM = 24
+FIRST_NS = 1_000_000_000
 EMPTY = 7  # the frame without a board
 
 
@@ -39,7 +40,7 @@ def folder(images: list[np.ndarray], tmp_path: Path) -> Path:
     data = tmp_path / "cam0"
     data.mkdir()
     for k, image in enumerate(images):
-        cv2.imwrite(str(data / f"{1000 + k}.png"), image)
+        cv2.imwrite(str(data / f"{FIRST_NS + k}.png"), image)
     return data
 
 
@@ -62,12 +63,12 @@ def same(a: Detections, b: Detections) -> bool:
 
 
 def in_memory(images: list[np.ndarray]) -> Frames:
-    return Frames(np.arange(len(images)) + 1000, images, SIZE)
+    return Frames(np.arange(len(images)) + FIRST_NS, images, SIZE)
 
 
 def test_all_frames_are_listed_and_the_empty_one_has_no_corners(images: list[np.ndarray]) -> None:
     found = detect(in_memory(images), BOARD, workers=1)
-    assert found.timestamps_ns.tolist() == list(range(1000, 1000 + NUM))
+    assert found.timestamps_ns.tolist() == list(range(FIRST_NS, FIRST_NS + NUM))
     assert set(found.seen_frames) == set(range(NUM)) - {EMPTY}
     assert len(found) == (NUM - 1) * 20
     assert found.image_size == SIZE
@@ -117,7 +118,7 @@ def test_whatever_detections_depend_on_makes_them_anew(
 
 def test_a_touched_file_is_looked_at_again(folder: Path, tmp_path: Path, detector_calls: list[int]) -> None:
     detect(load_frames(folder), BOARD, workers=1, cache=tmp_path / "cache")
-    os.utime(folder / "1003.png", ns=(1, 1))
+    os.utime(folder / f"{FIRST_NS + 3}.png", ns=(1, 1))
     detect(load_frames(folder), BOARD, workers=1, cache=tmp_path / "cache")
     assert len(detector_calls) == 2 * NUM
 
@@ -164,8 +165,8 @@ def test_no_board_in_any_frame_says_what_was_looked_for() -> None:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_damaged_image_is_named(folder: Path, workers: int) -> None:
-    (folder / "1009.png").write_bytes(b"not a png")
-    with pytest.raises(CalibrationError, match=r"1009\.png: not a readable image"):
+    (folder / f"{FIRST_NS + 9}.png").write_bytes(b"not a png")
+    with pytest.raises(CalibrationError, match=r"009\.png: not a readable image"):
         detect(load_frames(folder), BOARD, workers=workers)
 
 
