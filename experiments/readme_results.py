@@ -3,8 +3,8 @@
     JAXCAL_DATA=path/to/recordings python experiments/readme_results.py
     JAXCAL_DATA=path/to/recordings python experiments/readme_results.py --only cameras speed
 
-Runs take minutes each, 'truth' hours: its six hundred calibrations are kept in the user's cache, whence it goes on. The
-simulated recording is kept there, too; frames and corners are made anew.
+Runs take minutes each, 'truth' and 'stress' hours: their hundreds of calibrations are kept in the user's cache, whence
+they go on. The simulated recording is kept there, too; frames and corners are made anew.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from jaxcal.recording.tables import load_detections
 from jaxcal.results.ground_truth import compare_with_ground_truth
 from jaxcal.simulation import paper_rig, write_recording
 
-SECTIONS = ("results", "cameras", "truth", "speed")
+SECTIONS = ("results", "cameras", "truth", "stress", "speed")
 README = Path(__file__).resolve().parent.parent / "README.md"
 
 
@@ -42,6 +42,7 @@ def main() -> int:
             "results": rig_table,
             "cameras": camera_table,
             "truth": truth_table,
+            "stress": stress_table,
             "speed": speed_table,
         }
         block = makers[section]()
@@ -132,9 +133,21 @@ def camera_rows(title: str, name: str, detections: list, target: jaxcal.Target, 
 
 def truth_table() -> str:
     """What `validate_camera_imu.py` prints; runs that the cache holds are not made again."""
-    script = Path(__file__).with_name("validate_camera_imu.py")
-    rows = Path(platformdirs.user_cache_dir("jaxcal")) / "validate_camera_imu"
-    command = [sys.executable, str(script), "--out", str(rows)]
+    return kept_study("validate_camera_imu", "--out")
+
+
+def stress_table() -> str:
+    """The sum of what `stress_initialisation.py` prints of 500 problems; those that the cache holds are not solved
+    again."""
+    told = kept_study("stress_initialisation", "--problems", "500", "--seed", "0", "--output")
+    rows = [line for line in told.splitlines() if line.startswith(("| |", "|---", "| all |"))]
+    return "\n".join(rows)
+
+
+def kept_study(name: str, *options: str) -> str:
+    """What a script of this folder prints; its last option takes the folder in the cache that keeps its rows."""
+    script, rows = Path(__file__).with_name(f"{name}.py"), Path(platformdirs.user_cache_dir("jaxcal")) / name
+    command = [sys.executable, str(script), *options, str(rows)]
     return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
 
 

@@ -30,6 +30,7 @@ class _ConfiguredJax(importlib.abc.MetaPathFinder):
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
+        """jax's spec, with a loader that configures it; None for every other module, which others find."""
         if name != "jax":
             return None
         # To be found is not to be imported: whoever asks only whether jax is there leaves this in place.

@@ -72,6 +72,7 @@ class _Commands(click.Group):
     """A group of commands that ends in a message, not in a traceback, when the input makes a calibration impossible."""
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
+        """As click's, with the nearest command's name where one is mistyped."""
         name = args[0] if args else ""
         if name and not name.startswith("-") and self.get_command(ctx, name) is None:
             close = difflib.get_close_matches(name, self.list_commands(ctx), n=1)
@@ -80,6 +81,7 @@ class _Commands(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; a CalibrationError becomes one line on stderr and exit code 1."""
         try:
             return super().invoke(ctx)
         except CalibrationError as error:
