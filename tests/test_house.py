@@ -20,6 +20,7 @@ ALLOWED: dict[str, set[str]] = {
     "jaxcal.errors": set(),
     "jaxcal.progress": set(),
     "jaxcal.atomic": set(),
+    "jaxcal.child": set(),
     "jaxcal.jax_settings": set(),
     "jaxcal.observations": set(),
     "jaxcal.cameras": set(),
@@ -29,8 +30,8 @@ ALLOWED: dict[str, set[str]] = {
     "jaxcal.imu": {"jaxcal.trajectory"} | OBSERVATIONS,
     # rig.yaml names a target, and a table of corners is read with the target that it shows.
     "jaxcal.recording": {"jaxcal.targets"} | OBSERVATIONS,
-    "jaxcal.detection": {"jaxcal.targets"} | OBSERVATIONS,
-    "jaxcal.results": {"jaxcal.cameras", "jaxcal.targets"} | OBSERVATIONS,
+    "jaxcal.detection": {"jaxcal.child", "jaxcal.targets"} | OBSERVATIONS,
+    "jaxcal.results": {"jaxcal.cameras", "jaxcal.child", "jaxcal.targets"} | OBSERVATIONS,
     "jaxcal.calibration": {
         "jaxcal.cameras",
         "jaxcal.trajectory",

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from jaxcal.child import Child, python_child, usable_cores
 from jaxcal.cli.outcome import RERUN_FILE
 
 
@@ -38,8 +39,8 @@ def report(result: Path, sources: tuple[str, ...], out: Path | None, rerun: Path
     RESULT is a folder of jaxcal's, or its calibration.npz. A calibration does not hold pictures: without --images the
     page shows none. What `jaxcal cross-validate RESULT` found is shown, too.
     """
-    with _garbage_left():
-        _report(result, sources, out, rerun)
+    with _garbage_left(), _helper() as helper:
+        _report(result, sources, out, rerun, helper)
 
 
 @contextlib.contextmanager
@@ -54,7 +55,14 @@ def _garbage_left() -> Iterator[None]:
         gc.enable()
 
 
-def _report(result: Path, sources: tuple[str, ...], out: Path | None, rerun: Path | None) -> None:
+@contextlib.contextmanager
+def _helper() -> Iterator[Child | None]:
+    """A process to draw some of the figures, started first: its libraries load while ours do. None on one core."""
+    with python_child("jaxcal.results.report.helper") if usable_cores() > 1 else contextlib.nullcontext() as helper:
+        yield helper
+
+
+def _report(result: Path, sources: tuple[str, ...], out: Path | None, rerun: Path | None, helper: Child | None) -> None:
     from jaxcal.cli.progress_bars import ProgressBars
     from jaxcal.errors import CalibrationError
     from jaxcal.recording import load_frames
@@ -77,7 +85,7 @@ def _report(result: Path, sources: tuple[str, ...], out: Path | None, rerun: Pat
     path = out or folder / "report.html"
     with ProgressBars() as bars:
         found = load_cross_validation(folder)
-        verdict = write_report(calibration, path, images=images, progress=bars, cross_validation=found)
+        verdict = write_report(calibration, path, images=images, progress=bars, cross_validation=found, helper=helper)
     if rerun is not None:
         write_rerun(calibration, rerun)
     click.echo(verdict.headline)

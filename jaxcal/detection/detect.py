@@ -1,11 +1,11 @@
 """`detect`: the corners of a target in all frames of a camera, in parallel and cached."""
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from jaxcal.child import usable_cores
 from jaxcal.detection.cache import DetectionCache, Fingerprinted, detection_key
 from jaxcal.detection.hints import larger_board, nothing_found
 from jaxcal.detection.pool import detect_in_processes
@@ -44,7 +44,7 @@ def detect(
     store = None if cache is None else DetectionCache(Path(cache), name, detection_key(frames, target))
     detections = store.load() if store else None
     if detections is None:
-        parts = _all_parts(frames, target, workers or _cores(), store, progress, f"detect {name}")
+        parts = _all_parts(frames, target, workers or usable_cores(), store, progress, f"detect {name}")
         detections = _merged(frames, parts)
         larger = larger_board(name, frames, detections.seen_frames, target) if len(detections) else ""
         if larger:
@@ -97,7 +97,3 @@ def _merged(frames: Frames, parts: list[Corners]) -> Detections:
         pixels=np.concatenate([np.empty((0, 2)), *(part.pixels for part in parts)]),
         image_size=frames.image_size,
     )
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,18 +1,12 @@
-"""A pool of detector processes.
-
-Plain child processes on pipes, not `multiprocessing`: that would run the caller's script again in each child (which
-needs a `__main__` guard there), and it cannot start children from the daemonic workers of a cluster.
-"""
+"""A pool of detector processes."""
 
 import contextlib
-import os
 import pickle
 import queue
-import subprocess
-import sys
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 
+from jaxcal.child import Child, python_child
 from jaxcal.detection.worker import Chunk, Corners, Failure
 from jaxcal.errors import CalibrationError
 
@@ -24,9 +18,9 @@ def detect_in_processes(chunks: Iterable[Chunk], workers: int) -> Iterator[tuple
     processes.
     """
     with contextlib.ExitStack() as stack:
-        free: queue.SimpleQueue[subprocess.Popen[bytes]] = queue.SimpleQueue()
+        free: queue.SimpleQueue[Child] = queue.SimpleQueue()
         for _ in range(workers):
-            free.put(stack.enter_context(_process()))
+            free.put(stack.enter_context(python_child("jaxcal.detection.worker")))
         threads = ThreadPoolExecutor(workers)
         stack.callback(threads.shutdown, wait=True, cancel_futures=True)
         futures = {threads.submit(_ask, free, chunk): chunk for chunk in chunks}
@@ -38,7 +32,7 @@ def detect_in_processes(chunks: Iterable[Chunk], workers: int) -> Iterator[tuple
                 future.cancel()
 
 
-def _ask(free: "queue.SimpleQueue[subprocess.Popen[bytes]]", chunk: Chunk) -> Corners:
+def _ask(free: "queue.SimpleQueue[Child]", chunk: Chunk) -> Corners:
     process = free.get()
     try:
         answer = _exchange(process, chunk)
@@ -51,7 +45,7 @@ def _ask(free: "queue.SimpleQueue[subprocess.Popen[bytes]]", chunk: Chunk) -> Co
     raise RuntimeError(f"a detection process failed:\n{answer.message}")
 
 
-def _exchange(process: "subprocess.Popen[bytes]", chunk: Chunk) -> Corners | Failure:
+def _exchange(process: Child, chunk: Chunk) -> Corners | Failure:
     assert process.stdin is not None
     assert process.stdout is not None
     try:
@@ -63,17 +57,3 @@ def _exchange(process: "subprocess.Popen[bytes]", chunk: Chunk) -> Corners | Fai
             f"detection: a worker process ended unexpectedly (exit status {process.poll()}) in frames "
             f"{chunk.frames[0]} to {chunk.frames[-1]}. If memory ran out, use fewer workers; workers=1 needs none."
         ) from error
-
-
-@contextlib.contextmanager
-def _process() -> Iterator["subprocess.Popen[bytes]"]:
-    # Children find the same modules as this process, and leave the cores to each other.
-    path = os.pathsep.join(entry for entry in sys.path if entry)
-    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", "from jaxcal.detection.worker import main; main()"]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()

@@ -1,8 +1,6 @@
 """One detector process: chunks of images come in on a pipe, corners go out on another."""
 
-import os
 import pickle
-import sys
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +9,7 @@ from typing import BinaryIO
 import cv2
 import numpy as np
 
+from jaxcal.child import pipes
 from jaxcal.detection.corners import find_corners
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import ImageSequence
@@ -75,7 +74,4 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
 
 def main() -> None:
     """Serve on standard input and output."""
-    # Whatever a library prints must not end up between the answers.
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
-    serve(sys.stdin.buffer, answers)
+    serve(*pipes())

@@ -34,13 +34,23 @@ _RADIUS_BINS = 12
 
 
 def camera_pictures(
-    camera: CameraCalibration, target: Target, projection: ProjectionUncertainty | None, prefix: str
+    camera: CameraCalibration, projection: ProjectionUncertainty | None, residuals: list[Picture], prefix: str
 ) -> list[Picture]:
-    """All figures of a camera, in the order in which they are read; `prefix` is unique in the page."""
+    """All figures of a camera, those of its residuals among them, in the order in which they are read; `prefix` is
+    unique in the page."""
+    coverage_first, *others = residuals
     return [
-        _coverage_picture(camera, f"{prefix}-coverage"),
+        coverage_first,
         lens_picture(camera, f"{prefix}-lens"),
         projection_picture(camera, projection, f"{prefix}-projection"),
+        *others,
+    ]
+
+
+def residual_pictures(camera: CameraCalibration, target: Target, prefix: str) -> list[Picture]:
+    """The figures of a camera that need its corners and residuals, and nothing of its lens; coverage comes first."""
+    return [
+        _coverage_picture(camera, f"{prefix}-coverage"),
         _scatter_picture(camera, f"{prefix}-scatter"),
         _field_picture(camera, f"{prefix}-field"),
         _target_picture(camera, target, f"{prefix}-target"),

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator, NullLocator
 
 from jaxcal.atomic import write_text
+from jaxcal.child import Child
 from jaxcal.observations import Frames
 from jaxcal.progress import Progress, no_progress
 from jaxcal.results.advice import advice
@@ -22,6 +23,7 @@ from jaxcal.results.report.camera_figures import camera_pictures
 from jaxcal.results.report.cross_validation_section import cross_validation_section
 from jaxcal.results.report.drawing import ACCENT, Picture, label, nothing_to_show, panel, to_svg
 from jaxcal.results.report.frames import frame_pictures
+from jaxcal.results.report.helper import ask
 from jaxcal.results.report.imu_figures import imu_pictures
 from jaxcal.results.report.rig_figures import rig_pictures
 from jaxcal.results.report.rig_scene import rig_scene
@@ -38,15 +40,18 @@ def write_report(
     images: Mapping[str, Frames] | None = None,
     progress: Progress = no_progress,
     cross_validation: CrossValidation | None = None,
+    helper: Child | None = None,
 ) -> Verdict:
     """Write the report of a calibration to `path`, atomically, as a single HTML file without external references.
 
     `images` are the frames in which the corners of a camera were found, by camera name; cameras without them are
     reported without pictures of their detections. A `cross_validation` of this calibration gets a section of its own.
+    A `helper` (`python_child("jaxcal.results.report.helper")`) draws some of the figures meanwhile: it has to load what
+    this process has loaded already, and so is of use where it was started together with it, for a page of many cameras.
     Returns the verdict that the report opens with. Raises CalibrationError when an image has not its camera's size.
     """
     with _collections_put_off():
-        page, verdict = _page(calibration, images or {}, progress, cross_validation)
+        page, verdict = _page(calibration, images or {}, progress, cross_validation, helper)
     write_text(Path(path), page)
     progress(_STAGE, len(calibration.cameras) + 1, len(calibration.cameras) + 1)
     return verdict
@@ -70,11 +75,13 @@ def _page(
     images: Mapping[str, Frames],
     progress: Progress,
     cross_validation: CrossValidation | None,
+    helper: Child | None,
 ) -> tuple[str, Verdict]:
     """The report's HTML, and the verdict that it opens with."""
     total = len(calibration.cameras) + 1
     cameras = []
     progress(_STAGE, 0, total)
+    residuals = ask(helper, calibration)
     told = [camera for camera in calibration.cameras if can_be_told(calibration, camera)]
     projections = {camera.name: projection_uncertainty(calibration, camera.name) for camera in told}
     for index, camera in enumerate(calibration.cameras):
@@ -84,7 +91,7 @@ def _page(
                 "id": f"camera-{index}",
                 "tables": camera_tables(calibration, index),
                 "frames": frames,
-                "pictures": camera_pictures(camera, calibration.target, projections.get(camera.name), f"c{index}"),
+                "pictures": camera_pictures(camera, projections.get(camera.name), residuals(index), f"c{index}"),
             }
         )
         progress(_STAGE, index + 1, total)
