@@ -42,12 +42,18 @@ def info(file: str, resolution: tuple[int, int] | None, gap: float, as_json: boo
     import json
 
     from jaxcal.cli.progress_bars import ProgressBars
+    from jaxcal.errors import CalibrationError
     from jaxcal.recording import EventFile, event_facts
     from jaxcal.recording.bags import Bag, is_bag
     from jaxcal.recording.formats.rosbag import EVENT_TYPES
     from jaxcal.recording.places import split_place
 
     path, place = split_place(file)
+    if path.is_dir() and not is_bag(path):
+        raise CalibrationError(
+            f"{path}: a folder; expected an event recording or a bag. `jaxcal init {path}` says what images, events "
+            "and IMU data a folder holds."
+        )
     topics: list[Topic] = []
     if path.exists() and is_bag(path):
         with Bag(path) as bag:

@@ -96,7 +96,8 @@ def _board(ctx: click.Context, given: dict) -> "Target":
     needed = ["rows", "cols", "size", *{"aprilgrid": ["spacing"], "charuco": ["dictionary"]}.get(kind, [])]
     missing = [*([] if kind else ["type"]), *(name for name in needed if name not in given)]
     if missing:
-        raise click.UsageError(f"missing {', '.join(map(_option, missing))}.", ctx)
+        hint = " OpenCV's name of it, such as DICT_5X5_100." if "dictionary" in missing else ""
+        raise click.UsageError(f"missing {', '.join(map(_option, missing))}.{hint}", ctx)
     for name in given:
         if kind not in _ONLY.get(name, (kind,)):
             raise click.UsageError(f"a {kind} has no {_option(name)}.", ctx)

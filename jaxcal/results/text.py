@@ -233,7 +233,7 @@ def _target_configuration(target: Target) -> str:
             f"    Rows: {target.rows}",
             f"    Cols: {target.cols}",
             f"    Size: {target.tag_size} [m]",
-            f"    Spacing {target.tag_size * target.tag_spacing} [m]",
+            f"    Spacing {target.tag_size * target.tag_spacing:.12g} [m]",
         ]
     else:
         details = [f"  {key}: {value}" for key, value in target.to_yaml().items()]

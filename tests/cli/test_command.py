@@ -112,7 +112,7 @@ def test_a_file_with_several_boards_is_drawn_board_by_board(tmp_path: Path) -> N
     [
         ("--rows 4 --cols 5 --size 0.02", 2, "missing --type"),
         ("--type aprilgrid --rows 4 --size 0.02", 2, "missing --cols, --spacing"),
-        ("--type charuco --rows 4 --cols 5 --size 0.02", 2, "missing --dictionary"),
+        ("--type charuco --rows 4 --cols 5 --size 0.02", 2, "missing --dictionary. OpenCV's name of it"),
         ("--type checkerboard --rows 4 --cols 5 --size 0.02 --spacing 0.3", 2, "a checkerboard has no --spacing"),
         ("--type checkers --rows 4 --cols 5 --size 0.02", 2, "'checkers' is not one of"),
         ("--type checkerboard --rows four --cols 5 --size 0.02", 2, "'four' is not a valid integer"),

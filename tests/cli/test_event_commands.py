@@ -108,3 +108,5 @@ def test_mistakes_on_the_command_line(raw: Path, tmp_path: Path) -> None:
     wrong = jaxcal("info", raw, "--resolution", "640x480")
     assert (wrong.exit_code, "64x48 pixels, but 640x480 was given" in wrong.output) == (1, True)
     assert "error: " in jaxcal("info", tmp_path / "absent.raw").output
+    folder = jaxcal("info", tmp_path)
+    assert (folder.exit_code, f"`jaxcal init {tmp_path}`" in folder.output) == (1, True)
