@@ -58,7 +58,7 @@ def _configure() -> None:
     jax.config.update("jax_enable_x64", True)
     # Compiled programs are kept between runs, unless the user has chosen a place or switched it off.
     if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
-        jax.config.update("jax_compilation_cache_dir", platformdirs.user_cache_dir("jaxcal") + "/xla")
+        jax.config.update("jax_compilation_cache_dir", platformdirs.user_cache_dir("jaxcal") + "/jax")
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 import jax
 import pytest
 
+from jaxcal.programs import forget_programs
+
 
 def _data_folder() -> Path | None:
     value = os.environ.get("JAXCAL_DATA")
@@ -51,4 +53,5 @@ def _forget_programs() -> Iterator[None]:
     """Let go of a module's compiled programs: a process that keeps those of all modules runs out of memory maps, and
     XLA then crashes while it compiles."""
     yield
+    forget_programs()
     jax.clear_caches()

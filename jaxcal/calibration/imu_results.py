@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,6 +14,7 @@ from jaxcal.calibration.spline_setup import SplineGrid
 from jaxcal.calibration.state import RigState, transform
 from jaxcal.imu import imu_model
 from jaxcal.observations import ImuRecording
+from jaxcal.programs import stored_jit
 from jaxcal.results import ImuCalibration
 from jaxcal.trajectory import PoseSpline
 
@@ -27,7 +27,7 @@ def imu_calibrations(
     return [_one(fit, imus, noise, tuple(ratio.tolist()), chain_covariance, grid, i) for i, ratio in enumerate(ratios)]
 
 
-@eqx.filter_jit
+@stored_jit
 def _predicted(problem: RigProblem, state: RigState, imu: int) -> tuple:
     """Readings (I, S, 6), and R (I, S, 3, 3), p (I, S, 3) of the rig at the samples."""
     data = problem.imu

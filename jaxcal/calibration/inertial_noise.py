@@ -13,6 +13,7 @@ from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.robust import RobustFit
 from jaxcal.calibration.spline_setup import BinnedImu, SplineGrid
 from jaxcal.calibration.state import RigState
+from jaxcal.programs import stored_jit
 
 # Autocorrelations of IMU residuals below this are taken for noise.
 _CLEARLY_CORRELATED = 0.05
@@ -24,7 +25,7 @@ _CORRELATED = 2
 NoiseChoice = Literal["at least given", "given", "estimated"]
 
 
-@eqx.filter_jit
+@stored_jit
 def _whitened(problem: RigProblem, state: RigState, imu: int) -> jnp.ndarray:
     assert problem.imu is not None
     return inertial.imu_residuals(state, problem.imu, problem.order, problem.layout, imu)

@@ -6,7 +6,6 @@ left in rounding.
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -14,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxcal.calibration.state import SharedLayout
 from jaxcal.cameras import CameraModel
 from jaxcal.estimation import BlockArrow, factorise, single_threaded_blas
+from jaxcal.programs import stored_jit
 
 # Per group: columns (C_g, n, n) along which a step moves the parameters; None where steps are of the parameters.
 LensBasis = tuple[Float[Array, "_ _ _"] | None, ...]
@@ -58,7 +58,7 @@ def to_parameters(basis: LensBasis, layout: SharedLayout) -> np.ndarray | None:
     return matrix
 
 
-@eqx.filter_jit
+@stored_jit
 def _schur(equations: BlockArrow) -> Array:
     chain, shared = equations.diagonal()
     return factorise(equations, 1e-13 * jnp.maximum(chain, 1e-6 * jnp.max(chain)), jnp.zeros_like(shared)).schur

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +25,7 @@ from jaxcal.calibration.assemble import split_groups
 from jaxcal.calibration.known import KnownProblem
 from jaxcal.calibration.problem import camera_poses
 from jaxcal.cameras import CameraModel
+from jaxcal.programs import stored_jit
 from jaxcal.results import Calibration
 from jaxcal.results.cross_validation import FALSE_ALARMS, Cause, Evidence
 
@@ -279,7 +279,7 @@ def _jacobians(model: CameraModel, points: np.ndarray) -> tuple[np.ndarray, np.n
     return np.concatenate(by_point)[:count], np.concatenate(by_lens)[:count]
 
 
-@eqx.filter_jit
+@stored_jit
 def _derivatives(model: CameraModel, points: Float[Array, "M 3"]) -> tuple[Array, Array]:
     def project(vector: Array, point: Array) -> Array:
         return model.with_parameters(vector).project(point)

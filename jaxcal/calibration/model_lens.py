@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ from jaxtyping import Array
 
 from jaxcal.calibration.generic_lens import Projection
 from jaxcal.cameras import CameraModel
+from jaxcal.programs import stored_jit
 
 # Points per call: large enough to vectorise, small enough that padding costs nothing; and where there are many.
 _CHUNK, _LARGE_CHUNK = 4096, 32768
@@ -58,7 +58,7 @@ def _pixel(template: CameraModel, parameters: Array, point: Array) -> Array:
     return template.with_parameters(parameters).project(point)
 
 
-@eqx.filter_jit
+@stored_jit
 def _with_lens(template: CameraModel, parameters: Any, points: Any) -> tuple[Array, Array, Array, Array]:
     """Pixels (2, M), Jacobian by the point (2, 3, M), validity (M), Jacobian by the lens (n, 2, M); all finite."""
 
@@ -70,7 +70,7 @@ def _with_lens(template: CameraModel, parameters: Any, points: Any) -> tuple[Arr
     return jax.vmap(one, out_axes=-1)(points)
 
 
-@eqx.filter_jit
+@stored_jit
 def _without_lens(template: CameraModel, parameters: Any, points: Any) -> tuple[Array, Array, Array]:
     """As `_with_lens`, less the Jacobian by the lens."""
 

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from jaxcal.calibration.assemble import CameraFrames
 from jaxcal.calibration.state import SharedLayout
 from jaxcal.calibration.uncertainty import labels_of
 from jaxcal.cameras import CameraModel
+from jaxcal.programs import stored_jit
 
 # Boards that hardly any view tilts by more than this (degrees, to the image plane) show the focal length badly.
 _SMALL_TILT_DEG = 15.0
@@ -232,7 +232,7 @@ def _tilting_helps(
     return before / after if np.isfinite(before) and after > 0 else 1.0
 
 
-@eqx.filter_jit
+@stored_jit
 def _focal_sigma(
     model: CameraModel, points: Float[Array, "F N 3"], weight: Float[Array, "F N"], image_size: Float[Array, "2"]
 ) -> Float[Array, ""]:
@@ -329,7 +329,7 @@ def _lens_quantities(
     ]
 
 
-@eqx.filter_jit
+@stored_jit
 def _paraxial_rows(model: CameraModel) -> Float[Array, "4 n"]:
     """Derivatives by the parameters of: log of the focal lengths near the axis in x and y, and the axis's pixel."""
 

@@ -15,6 +15,7 @@ from jaxcal.calibration.target_shape import TargetGeometry, points_by_target, ta
 from jaxcal.calibration.vision import FrameEquations, FramePoses, VisionData
 from jaxcal.cameras import CameraModel
 from jaxcal.estimation import BlockArrow, robust_loss, scattered_band, scattered_chain
+from jaxcal.programs import stored_jit
 from jaxcal.trajectory import PoseSpline
 
 
@@ -219,13 +220,13 @@ class RigProblem(eqx.Module):
         return eqx.tree_at(lambda e: (e.corner, e.gradient_shared, e.cost), equations, (corner, gradient, cost))
 
 
-@eqx.filter_jit
+@stored_jit
 def corner_errors(problem: RigProblem, state: RigState) -> tuple:
     """Projection minus measurement, px, per group."""
     return problem.corner_errors(state)
 
 
-@eqx.filter_jit
+@stored_jit
 def camera_poses(problem: RigProblem, state: RigState) -> tuple:
     """T_cam_target (F, 4, 4) of every frame, per group."""
     return problem.camera_poses(state)

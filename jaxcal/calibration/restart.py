@@ -17,6 +17,7 @@ from jaxcal.calibration.state import RigState, SharedLayout
 from jaxcal.calibration.uncertainty import shared_information
 from jaxcal.cameras import CameraModel
 from jaxcal.estimation import BlockArrow, SolveResult, on_device, solve
+from jaxcal.programs import stored_jit
 
 logger = logging.getLogger(__name__)
 
@@ -286,7 +287,7 @@ def _left(fit: RobustFit, step: np.ndarray, chain: np.ndarray, sigmas: float) ->
     return start, halving > 0
 
 
-@eqx.filter_jit
+@stored_jit
 def _moved(problem: RigProblem, state: RigState, chain: Array, shared: Array) -> tuple[RigState, Array]:
     """The state after a step, and its cost without the robust loss."""
     moved = problem.retract(state, chain, shared)

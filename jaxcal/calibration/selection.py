@@ -2,7 +2,6 @@
 
 import heapq
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -10,6 +9,7 @@ from jaxcal.calibration import vision
 from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.state import RigState
 from jaxcal.estimation import single_threaded_blas
+from jaxcal.programs import stored_jit
 
 # The greedy choice starts from this share of the information of all views together, so that it is never singular.
 _FIRST_SHARE = 1e-9
@@ -73,7 +73,7 @@ def view_information(problem: RigProblem, state: RigState) -> Float[np.ndarray, 
     return reduced[:, free][:, :, free]
 
 
-@eqx.filter_jit
+@stored_jit
 def _frame_equations(problem: RigProblem, state: RigState, group: int) -> tuple[Array, Array, Array]:
     """Per frame: Hessian of the shared coordinates (F, q, q), cross (F, 6, q) and of the pose (F, 6, 6)."""
     data = problem.corners[group]

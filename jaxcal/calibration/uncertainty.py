@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -11,12 +10,13 @@ from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
 from jaxcal.estimation import BlockArrow, factorise, single_threaded_blas
 from jaxcal.imu import imu_model
+from jaxcal.programs import stored_jit
 
 # Eigenvalues of the information matrix, scaled to unit diagonal, below which a direction counts as unobserved.
 _UNOBSERVED = 1e-11
 
 
-@eqx.filter_jit
+@stored_jit
 def _schur(equations: BlockArrow) -> tuple:
     chain, shared = equations.diagonal()
     # Keeps chain blocks that nothing observes (knots in a gap) from spoiling the factor; far below any information.

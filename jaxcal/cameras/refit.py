@@ -3,7 +3,6 @@
 import logging
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from jaxtyping import Array, Float
 from jaxcal.cameras.base import CameraModel
 from jaxcal.cameras.registry import camera_model, model_name
 from jaxcal.errors import CalibrationError
+from jaxcal.programs import stored_jit
 
 logger = logging.getLogger(__name__)
 
@@ -197,7 +197,7 @@ def _levenberg_marquardt(
     return first.with_parameters(value), float(cost)
 
 
-@eqx.filter_jit
+@stored_jit
 def _equations(
     model: CameraModel, rays: Float[Array, "M 3"], pixels: Float[Array, "M 2"], root_weight: Float[Array, " M"]
 ) -> tuple[Float[Array, ""], Float[Array, " n"], Float[Array, "n n"]]:
@@ -232,14 +232,14 @@ def _rays_of(source: CameraModel, pixels: np.ndarray) -> tuple[np.ndarray, np.nd
     return np.asarray(rays)[:count], np.asarray(valid)[:count] & (np.asarray(error)[:count] < 1e-3)
 
 
-@eqx.filter_jit
+@stored_jit
 def _unprojected(source: CameraModel, pixels: Float[Array, "M 2"]) -> tuple[Array, Array, Array]:
     rays = source.unproject(pixels)
     error = jnp.linalg.norm(source.project(rays) - pixels, axis=1)
     return rays, error, jax.vmap(source.is_valid)(rays)
 
 
-@eqx.filter_jit
+@stored_jit
 def _validity(model: CameraModel, rays: Float[Array, "M 3"]) -> Array:
     return jax.vmap(model.is_valid)(rays)
 

@@ -15,6 +15,7 @@ from jaxcal.estimation.block_arrow import BlockArrow
 from jaxcal.estimation.descent import BlockArrowDescent, BlockStep
 from jaxcal.estimation.problem import BlockArrowProblem, State
 from jaxcal.estimation.threads import single_threaded_blas
+from jaxcal.programs import stored_jit
 
 _MAX_HISTORY = 256
 FIRST_DAMPING = 1e-4
@@ -276,4 +277,4 @@ def solve_inside(
     return SolveResult(solution.value, stats["equations"], stats["history"], stats["iterations"], stats["converged"])
 
 
-_solve = eqx.filter_jit(solve_inside)
+_solve = stored_jit(solve_inside)

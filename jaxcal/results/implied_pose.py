@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -18,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.cameras import CameraModel
+from jaxcal.programs import stored_jit
 from jaxcal.results.rays import rays_through
 
 # Differences beyond this multiple of their median count less: where a lens was not seen it may be anywhere.
@@ -104,7 +104,7 @@ def _fit(at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], free: np.nda
     return whole(least_squares(residuals, first, jacobian, x_scale="jac", loss="soft_l1", f_scale=scale).x)
 
 
-@eqx.filter_jit
+@stored_jit
 def _moved(
     model: CameraModel, rays: Float[Array, "K 3"], inverse_range: Float[Array, ""], vector: Float[Array, "6"]
 ) -> tuple[Array, Array, Array]:

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +22,7 @@ from jaxtyping import Array, Float
 
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
+from jaxcal.programs import stored_jit
 from jaxcal.results.calibration import Calibration, CameraCalibration
 from jaxcal.results.rays import rays_through
 
@@ -160,7 +160,7 @@ def implied_motion(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
     return scale[:, None] * (np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) @ (scale[:, None] * right))
 
 
-@eqx.filter_jit
+@stored_jit
 def _sensitivities(
     model: CameraModel,
     corners: Float[Array, "M 3"],

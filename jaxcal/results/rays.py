@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.cameras import CameraModel
+from jaxcal.programs import stored_jit
 
 # A ray that projects further than this from its pixel (px) is not the pixel's: it lies outside the lens's domain.
 _MISSED_PX = 1e-3
@@ -41,7 +41,7 @@ def look_through(model: CameraModel, pixels: np.ndarray) -> Look:
     return Look(rays[: len(pixels)], valid[: len(pixels)], scale, centre)
 
 
-@eqx.filter_jit
+@stored_jit
 def _look_through(model: CameraModel, pixels: Float[Array, "K 2"]) -> tuple[Array, Array, Array, Array]:
     rays = model.unproject(pixels)
     missed = jnp.linalg.norm(model.project(rays) - pixels, axis=-1)

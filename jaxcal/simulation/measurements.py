@@ -3,7 +3,6 @@
 import functools
 from dataclasses import dataclass, field
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
 from jaxcal.imu import imu_model, respond
 from jaxcal.observations import Detections, ImuRecording
+from jaxcal.programs import stored_jit
 from jaxcal.simulation.motion import angular_accelerations, poses_at, rates
 from jaxcal.simulation.rig import SimulatedCamera, SimulatedRig
 from jaxcal.targets import AprilGrid, Charuco
@@ -26,7 +26,7 @@ def T_cam_target(rig: SimulatedRig, camera: SimulatedCamera, motion_time_s: np.n
     return camera.T_cam_imu @ np.linalg.inv(poses_at(rig.motion, motion_time_s))
 
 
-@eqx.filter_jit
+@stored_jit
 def project_points(
     model: CameraModel, T: Float[Array, "f 4 4"], points: Float[Array, "n 3"]
 ) -> tuple[Float[Array, "f n 2"], Bool[Array, "f n"]]:

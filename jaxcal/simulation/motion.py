@@ -9,6 +9,8 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxcal.programs import stored_jit
+
 _SHORTEST = 256
 
 
@@ -64,7 +66,7 @@ def _derivative(function: Callable[[Array], Array], t: Float[ArrayLike, ""]) -> 
     return jax.jvp(function, (at,), (jnp.ones_like(at),))[1]
 
 
-@eqx.filter_jit
+@stored_jit
 def poses(motion: Motion, times_s: Float[Array, " n"]) -> Float[Array, "n 4 4"]:
     """T_target_imu at each of `times_s` (n,) seconds."""
     return jax.vmap(motion.pose)(times_s)
@@ -79,13 +81,13 @@ def poses_at(motion: Motion, times_s: np.ndarray) -> np.ndarray:
     return np.asarray(poses(motion, jnp.asarray(padded)))[: len(times_s)]
 
 
-@eqx.filter_jit
+@stored_jit
 def rates(motion: Motion, times_s: Float[Array, " n"]) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
     """Angular velocity (IMU frame, rad/s) and acceleration (target frame, m/s^2) at each of `times_s` (n,)."""
     return jax.vmap(motion.angular_velocity)(times_s), jax.vmap(motion.acceleration)(times_s)
 
 
-@eqx.filter_jit
+@stored_jit
 def angular_accelerations(motion: Motion, times_s: Float[Array, " n"]) -> Float[Array, "n 3"]:
     """Derivative of the angular velocity (IMU frame, rad/s^2) at each of `times_s` (n,)."""
     return jax.vmap(lambda t: _derivative(motion.angular_velocity, t))(times_s)

@@ -2,13 +2,13 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from jaxcal.cameras import CameraModel
+from jaxcal.programs import stored_jit
 from jaxcal.simulation.pattern import BLACK, Pattern
 
 # The pixel's own area blurs like a Gaussian of this variance (px^2).
@@ -107,7 +107,7 @@ def pixel_rays(model: CameraModel, image_size: tuple[int, int]) -> PixelRays:
     return _refine_rays(model, jnp.asarray(pixels), jnp.asarray(start))
 
 
-@eqx.filter_jit
+@stored_jit
 def _refine_rays(model: CameraModel, pixels: Float[Array, "n 2"], start: Float[Array, "n 3"]) -> PixelRays:
     def inverse(ray: Float[Array, "3"]) -> Float[Array, "3 2"]:
         """Change of the ray per pixel: the least one, orthogonal to the ray, which the projection does not see."""

@@ -22,6 +22,7 @@ from jaxcal.calibration.score_noise import design_effect
 from jaxcal.calibration.state import RigState
 from jaxcal.calibration.uncertainty import named_jacobian
 from jaxcal.estimation import factorise, single_threaded_blas, solve_inside
+from jaxcal.programs import stored_jit
 from jaxcal.results import Calibration
 
 _MAX_STEPS = 60
@@ -92,7 +93,7 @@ def run_batch(batch: Batch, pixels: list[list[np.ndarray]] | None, of_view: np.n
     return replace(fits, std=fits.std * np.sqrt(_of_blocks(known, batch.effects)))
 
 
-@eqx.filter_jit
+@stored_jit
 def _many(
     problem: RigProblem,
     state: RigState,
