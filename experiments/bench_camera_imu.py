@@ -21,6 +21,7 @@ import json
 import os
 import platform
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -257,8 +258,7 @@ def bench(name: str, duration_s: float, repeats: int, gpu: bool) -> None:
         folder = Path(made)
         corners = in_new_process("record", name, duration_s, folder, 0, gpu)
         # The simulation's programs are no part of the calibration's first call.
-        for program in (folder / "programs").glob("*"):
-            program.unlink()
+        shutil.rmtree(folder / "programs", ignore_errors=True)
         load = os.getloadavg()[0]
         cold = in_new_process("run", name, duration_s, folder, 0, gpu)
         disk = in_new_process("run", name, duration_s, folder, repeats, gpu)

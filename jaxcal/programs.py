@@ -28,6 +28,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 from jax.experimental import serialize_executable
+from jaxlib import xla_client
 
 from jaxcal.atomic import write_bytes
 
@@ -44,6 +45,7 @@ _MOST_FILES = 1500
 P = ParamSpec("P")
 R = TypeVar("R")
 _Program = Callable[[list[Any]], Any]
+_COMPILING = threading.Lock()
 _IN_MEMORY: list[dict[Any, _Program | None]] = []  # of each function
 
 
@@ -57,7 +59,7 @@ def stored_jit(function: Callable[P, R]) -> Callable[P, R]:
     jitted = eqx.filter_jit(function)
     programs: dict[Any, _Program | None] = {}
     _IN_MEMORY.append(programs)
-    lock = threading.Lock()
+    lock = threading.RLock()  # a function may call itself on numbers while it is traced
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -123,9 +125,7 @@ def _description(leaf: Any) -> Any:
 
 @dataclass(frozen=True)
 class _Slot:
-    """Where the array of this number belongs in a result."""
-
-    number: int
+    """Where an array belongs in a result: the first of them in the first slot."""
 
 
 def _program(function: Callable[..., Any], leaves: list[Any], tree: Any) -> _Program | None:
@@ -185,15 +185,10 @@ def _make(function: Callable[..., Any], leaves: list[Any], tree: Any, path: Path
             everything[place] = array
         args, kwargs = jax.tree.unflatten(tree, everything)
         results, structure = jax.tree.flatten(function(*args, **kwargs))
-        numbers = iter(range(len(results)))
-        are_arrays = [_is_array(result) for result in results]
         skeletons.append(
-            jax.tree.unflatten(
-                structure,
-                [_Slot(next(numbers)) if is_array else r for r, is_array in zip(results, are_arrays, strict=True)],
-            )
+            jax.tree.unflatten(structure, [_Slot() if _is_array(result) else result for result in results])
         )
-        return [result for result, is_array in zip(results, are_arrays, strict=True) if is_array]
+        return [result for result in results if _is_array(result)]
 
     of_arrays.__name__ = function.__name__
     start = time.perf_counter()
@@ -210,12 +205,14 @@ def _compiled(lowered: Any) -> tuple[Any, bool]:
     """The compiled program, and whether it was compiled here. XLA writes one that it has loaded without its kernels, so
     what jax's cache had is not stored; and jax's cache does not get what is."""
     hits = _cache_hits()
-    before, least = hits.count, _setting("jax_persistent_cache_min_compile_time_secs")
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", float("inf"))
-    try:
-        return lowered.compile(), hits.count == before
-    finally:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
+    least_seconds = "jax_persistent_cache_min_compile_time_secs"
+    with _COMPILING:
+        before, least = hits.count, _setting(least_seconds)
+        jax.config.update(least_seconds, float("inf"))
+        try:
+            return lowered.compile(), hits.count == before
+        finally:
+            jax.config.update(least_seconds, least)
 
 
 class _CacheHits:
@@ -307,7 +304,9 @@ def _circumstances() -> str:
     releases = [f"{name} {importlib.metadata.version(name)}" for name in _LIBRARIES]
     settings = [_setting(f"jax_{name}") for name in ("enable_x64", "default_matmul_precision", "numpy_dtype_promotion")]
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    machine = [sys.version, platform.platform(), _processor(), cores, os.environ.get("XLA_FLAGS")]
+    # XLA's flags as it has read them, the generator of code among them.
+    flags = xla_client.CompileOptions().SerializeAsString()
+    machine = [sys.version, platform.platform(), _processor(), cores, flags]
     return repr([source.hexdigest(), releases, settings, machine])
 
 
