@@ -379,6 +379,17 @@ def test_other_files_are_refused(tmp_path: Path, name: str, text: str, message: 
     assert str(tmp_path / name) in str(caught.value)
 
 
+@pytest.mark.parametrize("format", ["ros", "opencv"])
+def test_a_lens_with_too_few_coefficients_is_named_with_its_file(tmp_path: Path, format: str) -> None:
+    (path,) = write_calibration(make_rig(["pinhole-equi"], True, 0), tmp_path, format).paths
+    head, tail = path.read_text().split("distortion_coefficients:", 1)
+    tail = re.sub(r"(rows|cols): 4", r"\1: 3", tail, count=1)
+    path.write_text(head + "distortion_coefficients:" + re.sub(r",[^,\]]*\]", "]", tail, count=1))
+    with pytest.raises(CalibrationError, match="3 distortion coefficients") as caught:
+        read_calibration(path)
+    assert str(path) in str(caught.value)
+
+
 def test_two_calibrations_in_a_folder_are_not_guessed_between(tmp_path: Path) -> None:
     rig = make_rig(["pinhole-radtan"], True, 0)
     write_calibration(rig, tmp_path, "basalt")

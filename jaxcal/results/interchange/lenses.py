@@ -1,5 +1,7 @@
 """Lenses as other tools write them down: OpenCV's coefficients, and models that are one another's in other numbers."""
 
+from typing import Any
+
 import numpy as np
 
 from jaxcal.cameras import CameraModel, camera_model, model_name
@@ -26,6 +28,14 @@ def coefficients_of(model: CameraModel, count: int) -> np.ndarray:
     """The distortion (count,), its end filled with zeros: the same lens in a model with more coefficients."""
     distortion = np.asarray(model.distortion)
     return np.pad(distortion, (0, count - len(distortion)))
+
+
+def lens(name: str, intrinsics: Any, distortion: Any, where: str) -> CameraModel:
+    """A model by name from the numbers of a file; CalibrationError names the place where there are too few or many."""
+    try:
+        return camera_model(name).create(intrinsics, distortion)
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from error
 
 
 def planar(core: np.ndarray, coefficients: np.ndarray, where: str) -> CameraModel:

@@ -5,10 +5,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jaxcal.cameras import CameraModel, camera_model, model_name
+from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.results.interchange.documents import Document
-from jaxcal.results.interchange.lenses import PLANAR, core_of, planar
+from jaxcal.results.interchange.lenses import PLANAR, core_of, lens, planar
 from jaxcal.results.interchange.rig import CalibratedRig, camera_alone, chained, file_stems
 from jaxcal.results.kalibr import CamchainCamera, numbers, rigid_transform
 
@@ -86,11 +86,11 @@ def _model(document: Document, where: str) -> CameraModel:
     if abs(matrix[0, 1]) > 1e-9 * matrix[0, 0]:
         raise CalibrationError(f"{where}: the camera matrix is skewed; no model here is. Calibrate with skew fixed.")
     if document.content.get("fisheye_model"):
-        return camera_model("pinhole-equi").create(core, distortion)
+        return lens("pinhole-equi", core, distortion, where)
     if "xi" in document.content:
         xi = _flat(document["xi"], f"{where}: xi")
         name = "omni-radtan" if distortion.any() else "omni-none"
-        return camera_model(name).create([*xi, *core], distortion if distortion.any() else ())
+        return lens(name, [*xi, *core], distortion if distortion.any() else (), where)
     return planar(core, distortion, where)
 
 

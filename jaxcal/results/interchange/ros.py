@@ -3,10 +3,10 @@
 import numpy as np
 import yaml
 
-from jaxcal.cameras import CameraModel, camera_model, model_name
+from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.results.interchange.documents import Document, value_of
-from jaxcal.results.interchange.lenses import coefficients_of, core_of, planar
+from jaxcal.results.interchange.lenses import coefficients_of, core_of, lens, planar
 from jaxcal.results.interchange.rig import CalibratedRig, camera_alone, file_stems
 from jaxcal.results.kalibr import CamchainCamera, numbers
 
@@ -71,7 +71,7 @@ def _model(document: Document, where: str) -> CameraModel:
     # Files without a model are from before there were others.
     kind = str(document.content.get("distortion_model", "plumb_bob"))
     if kind in ("equidistant", "fisheye"):
-        return camera_model("pinhole-equi").create(core, distortion)
+        return lens("pinhole-equi", core, distortion, where)
     if kind in ("plumb_bob", "rational_polynomial", "none", ""):
         return planar(core, distortion, where)
     raise CalibrationError(
