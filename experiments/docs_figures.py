@@ -26,7 +26,7 @@ import jaxcal
 from jaxcal.atomic import write_bytes
 from jaxcal.recording import load_frames
 from jaxcal.results import projection_uncertainty
-from jaxcal.results.report.camera_figures import camera_pictures
+from jaxcal.results.report.camera_figures import camera_pictures, residual_pictures
 
 FIGURES = Path(__file__).resolve().parent.parent / "jaxcal" / "docs" / "figures"
 COURSE = Path(platformdirs.user_cache_dir("jaxcal")) / "course"
@@ -133,7 +133,8 @@ def of_report(course: Path, title: str) -> str:
     calibration = jaxcal.load_calibration(course / "out")
     camera = calibration.cameras[0]
     projection = projection_uncertainty(calibration, camera.name)
-    pictures = camera_pictures(camera, calibration.target, projection, "docs")
+    residuals = residual_pictures(camera, calibration.target, "docs")
+    pictures = camera_pictures(camera, projection, residuals, "docs")
     found = {picture.title: picture.svg for picture in pictures}
     if title not in found:
         raise jaxcal.CalibrationError(f"the report has no figure '{title}'; it has {', '.join(found)}.")
