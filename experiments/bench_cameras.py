@@ -4,9 +4,9 @@
     python experiments/bench_cameras.py --only mono whole
 
 Each part solves the same corners from the same start to the same optimum, and says what that optimum cost. 'cold' is
-the first call of a program in a process, compilation included; 'warm' the best of five later ones (of twenty, in turn,
-for one camera); CPU seconds are of all threads. Ratios are of warm wall time, theirs over ours. Ceres needs
-`pip install jaxcal[bench]`.
+the first call of a program in a process: compilation included, at a machine's first run, else loading from the disk;
+'warm' the best of five later ones (of twenty, in turn, for one camera); CPU seconds are of all threads. Ratios are of
+warm wall time, theirs over ours. Ceres needs `pip install jaxcal[bench]`.
 
 - mono: one camera, 40 and 200 views of 144 corners, against cv2.calibrateCamera
 - rig: four cameras, 200 and 1000 views, against Ceres, and (200) against OpenCV 5's cv2.calibrateMultiview
