@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxcal.detection.homography import apply_homography, fit_homography
 from jaxcal.detection.outliers import agreeing_corners
+from jaxcal.detection.pattern_fit import fit_pattern
 from jaxcal.detection.refine import refine_corners
 from jaxcal.targets import AprilGrid
 
@@ -25,6 +26,7 @@ _ENOUGH_TAGS = 4
 # An image is speckled where more than this share of pixels differs by so much from their neighbours' median.
 _SPECKLE_GREY, _SPECKLE_SHARE = 50, 0.005
 _MAX_ROUNDS = 12
+_INTO_GAP, _INTO_BORDER = 0.6, 0.9  # how far from a tag's corner the pattern is fitted
 
 
 @dataclass(frozen=True)
@@ -272,6 +274,8 @@ def _checked_corners(image: np.ndarray, tags: _Tags, target: AprilGrid) -> tuple
         return np.empty(0, np.int64), np.empty((0, 2))
     refined, stayed = _refined(image, tags, target)
     point = np.concatenate([target.tag_points(target.first_id + int(tag)) for tag in tags.ids])
-    point, pixels = point[stayed.ravel()], refined[stayed]
-    keep = agreeing_corners(_board(target)[tags.ids][stayed], pixels, (image.shape[1], image.shape[0]))
+    point, board = point[stayed.ravel()], _board(target)[tags.ids][stayed]
+    reach = min(_INTO_GAP * target.tag_spacing, _INTO_BORDER * _BORDER / _CELLS) * target.tag_size
+    pixels = fit_pattern(image, board, refined[stayed], (reach, reach))
+    keep = agreeing_corners(board, pixels, (image.shape[1], image.shape[0]))
     return point[keep], pixels[keep]

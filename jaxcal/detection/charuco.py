@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxcal.detection.homography import apply_homography, fit_homography
 from jaxcal.detection.outliers import agreeing_corners
+from jaxcal.detection.pattern_fit import fit_pattern
 from jaxcal.detection.refine import refine_corners
 from jaxcal.targets import Charuco
 
@@ -29,8 +30,10 @@ def find_charuco(image: np.ndarray, target: Charuco) -> tuple[np.ndarray, np.nda
     from_top, column = np.divmod(np.ravel(ids).astype(np.int64), target.cols - 1)
     point = (target.rows - 2 - from_top) * (target.cols - 1) + column
     refined, trusted = refine_corners(image, rough, _half_windows(rough, point, target))
-    point, pixels = point[trusted], refined[trusted]
-    keep = agreeing_corners(target.points[point, :2], pixels, (image.shape[1], image.shape[0]))
+    point = point[trusted]
+    board, rim = target.points[point, :2], 0.5 * (target.square_size - target.marker_size)
+    pixels = fit_pattern(image, board, refined[trusted], (rim, rim))
+    keep = agreeing_corners(board, pixels, (image.shape[1], image.shape[0]))
     return point[keep], pixels[keep]
 
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from jaxcal.detection.outliers import agreeing_corners
+from jaxcal.detection.pattern_fit import fit_pattern
 from jaxcal.detection.refine import refine_corners
 from jaxcal.targets import Checkerboard
 
@@ -36,8 +37,10 @@ def find_checkerboard(image: np.ndarray, target: Checkerboard) -> tuple[np.ndarr
     corners = grid.reshape(-1, 2)
     refined, trusted = refine_corners(image, corners, _half_windows(grid).ravel())
     point = np.flatnonzero(trusted)
-    keep = agreeing_corners(target.points[point, :2], refined[point], (image.shape[1], image.shape[0]))
-    return point[keep], refined[point[keep]]
+    board, reach = target.points[point, :2], (_REACH * (target.col_spacing or target.spacing), _REACH * target.spacing)
+    pixels = fit_pattern(image, board, refined[point], reach)
+    keep = agreeing_corners(board, pixels, (image.shape[1], image.shape[0]))
+    return point[keep], pixels[keep]
 
 
 def _find(image: np.ndarray, target: Checkerboard) -> np.ndarray | None:

@@ -37,7 +37,7 @@ def test_every_corner_at_any_roll(roll: float, tilt: tuple[float, float]) -> Non
     assert np.abs(pixels - drawn.pixels[point]).max() < 0.1
 
 
-@pytest.mark.parametrize(("noise", "limit"), [(3, 0.05), (10, 0.12)])
+@pytest.mark.parametrize(("noise", "limit"), [(3, 0.02), (10, 0.05)])
 def test_accuracy_in_noise(noise: float, limit: float) -> None:
     errors = []
     for k in range(6):

@@ -74,7 +74,7 @@ def test_boards_of_three_rows_are_found_in_the_right_place_or_not_at_all(
     assert np.all(np.abs(pixels - drawn.pixels[point]) < 0.1)
 
 
-@pytest.mark.parametrize(("noise", "limit"), [(0, 0.03), (4, 0.06), (8, 0.1)])
+@pytest.mark.parametrize(("noise", "limit"), [(0, 0.02), (4, 0.03), (8, 0.04)])
 def test_accuracy(noise: float, limit: float) -> None:
     errors, count = [], 0
     for k in range(8):

@@ -1,0 +1,151 @@
+"""Corners by the board's pattern: better than gradients in a window, in any view, light and blur; never led astray."""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+from drawn_boards import View, board_to_pixel, draw_aprilgrid, draw_charuco, draw_checkerboard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxcal import AprilGrid, Checkerboard
+from jaxcal.detection import find_corners
+from jaxcal.detection.pattern_fit import fit_pattern
+from jaxcal.detection.refine import refine_corners
+from jaxcal.targets import Charuco, Target
+
+SIZE = (480, 360)
+CHECKERBOARD = Checkerboard(rows=6, cols=7, spacing=0.05)
+APRILGRID = AprilGrid(4, 5, 0.055, 0.3)
+CHARUCO = Charuco(6, 7, 0.06, 0.045, "DICT_4X4_50")
+DRAW: dict[type, Callable[..., View]] = {
+    Checkerboard: draw_checkerboard,
+    AprilGrid: draw_aprilgrid,
+    Charuco: draw_charuco,
+}
+
+
+def view(board: Target, roll: float, tilt: tuple[float, float], noise: float, distance: float = 0.75) -> View:
+    centre = tuple(board.points[:, :2].mean(axis=0).tolist())
+    return DRAW[type(board)](board, board_to_pixel(centre, distance, roll, tilt, SIZE), SIZE, noise)
+
+
+def rms(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+def grid(drawn: View, board: Target, reach: float = 0.02) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+    """Corners well inside the image: their places on the board, their true pixels, and a reach."""
+    inside = ((drawn.pixels > 15) & (drawn.pixels < np.array(SIZE) - 16)).all(axis=1)
+    return board.points[inside, :2], drawn.pixels[inside], (reach, reach)
+
+
+@given(
+    board=st.sampled_from([CHECKERBOARD, APRILGRID, CHARUCO]),
+    roll=st.floats(-1.2, 1.2),
+    tilt=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
+    noise=st.floats(5, 20),
+)
+@settings(deadline=None, max_examples=30)
+def test_errors_are_half_of_those_of_gradients_in_a_window(
+    board: Target, roll: float, tilt: tuple[float, float], noise: float
+) -> None:
+    drawn = view(board, roll, tilt, noise)
+    point, pixels = find_corners(drawn.image, board)
+    assert len(point) >= 0.7 * len(grid(drawn, board)[0])
+    true = drawn.pixels[point]
+    spacing = np.linalg.norm(true[:, None] - true, axis=2)
+    np.fill_diagonal(spacing, np.inf)
+    half = np.clip(np.floor(0.4 * spacing.min(axis=1)), 2, 9).astype(np.int64)
+    gradients, _ = refine_corners(drawn.image, true, half)
+    assert rms(pixels - true) < 0.65 * rms(gradients - true) + 0.005
+    assert np.abs(pixels - true).max() < 0.02 * noise + 0.05
+
+
+@pytest.mark.parametrize("board", [CHECKERBOARD, APRILGRID, CHARUCO], ids=["checkerboard", "AprilGrid", "ChArUco"])
+@pytest.mark.parametrize("light", ["from one side", "added from one side", "dim", "gamma", "blurred", "negative"])
+def test_light_and_blur_move_no_corner(board: Target, light: str) -> None:
+    drawn = view(board, 0.3, (0.3, -0.2), noise=0)
+    known, true, _ = grid(drawn, board)
+    reach = 0.4 * CHECKERBOARD.spacing if board is CHECKERBOARD else 0.0075
+    ramp = np.linspace(0.2, 1.0, SIZE[0])
+    grey = drawn.image.astype(np.float64)
+    lit = {
+        "from one side": grey * ramp,
+        "added from one side": 0.5 * grey + 120 * ramp,
+        "dim": 0.1 * grey + 10,
+        "gamma": 255 * (grey / 255) ** 0.4,
+        "blurred": cv2.GaussianBlur(grey, (0, 0), 1.5),
+        "negative": 255 - grey,
+    }[light]
+    image = np.clip(np.round(lit), 0, 255).astype(np.uint8)
+    found = fit_pattern(image, known, true + np.array([0.4, -0.3]), (reach, reach))
+    # Light falls off across an edge: that shifts it by design of the image, not of the fit, by a tenth of a pixel.
+    assert rms(found - true) < 0.06
+    assert np.abs((found - true).mean(axis=0)).max() < 0.03
+
+
+def test_straight_edges_through_a_curving_lens() -> None:
+    """They are not straight in such an image."""
+    drawn = view(CHECKERBOARD, 0.2, (0.2, 0.2), noise=0)
+    centre, strength = (np.array(SIZE) - 1) / 2, 0.45 / 300**2
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]].astype(np.float64)
+    from_centre = np.stack([x, y], axis=-1) - centre
+    source = centre + from_centre * (1 + strength * np.sum(from_centre**2, axis=-1, keepdims=True))
+    u, v = np.moveaxis(source.astype(np.float32), -1, 0)
+    image = cv2.remap(drawn.image, u, v, cv2.INTER_CUBIC)
+    bent = drawn.pixels.copy()
+    for _ in range(100):
+        bent = centre + (drawn.pixels - centre) / (1 + strength * np.sum((bent - centre) ** 2, axis=1, keepdims=True))
+    found = fit_pattern(image, CHECKERBOARD.points[:, :2], bent + 0.3, (0.02, 0.02))
+    assert rms(found - bent) < 0.03
+
+
+@given(which=st.integers(0, len(CHECKERBOARD.points) - 1), angle=st.floats(0, 2 * np.pi), distance=st.floats(1.5, 5.0))
+@settings(deadline=None, max_examples=30)
+def test_a_corner_out_of_place_is_found_where_its_neighbours_say(which: int, angle: float, distance: float) -> None:
+    drawn = view(CHECKERBOARD, 0.2, (0.2, 0.2), noise=4)
+    known, true, reach = grid(drawn, CHECKERBOARD)
+    start = true.copy()
+    start[which] += distance * np.array([np.cos(angle), np.sin(angle)])
+    assert np.abs(fit_pattern(drawn.image, known, start, reach) - true).max() < 0.1
+
+
+@pytest.mark.parametrize("grey", [np.zeros, np.ones, None], ids=["black", "one grey", "noise"])
+def test_where_there_is_no_pattern_corners_stay(grey: Callable[..., np.ndarray] | None) -> None:
+    known, true, reach = grid(view(CHECKERBOARD, 0.2, (0.2, 0.2), 0), CHECKERBOARD)
+    noise = np.random.default_rng(3).integers(0, 255, (SIZE[1], SIZE[0])).astype(np.uint8)
+    image = noise if grey is None else (120 * grey((SIZE[1], SIZE[0]))).astype(np.uint8)
+    np.testing.assert_array_equal(fit_pattern(image, known, true, reach), true)
+
+
+def test_too_few_corners_or_all_in_a_row_stay() -> None:
+    drawn = view(CHECKERBOARD, 0.2, (0.2, 0.2), 0)
+    known, true, reach = grid(drawn, CHECKERBOARD)
+    for some in (slice(0, 5), slice(0, 7)):  # five, and the lowest row
+        np.testing.assert_array_equal(fit_pattern(drawn.image, known[some], true[some], reach), true[some])
+
+
+@pytest.mark.parametrize("shift", [(-140, 0), (140, 0), (0, -110), (0, 110)])
+def test_windows_end_at_the_edge_of_the_image(shift: tuple[int, int]) -> None:
+    drawn = view(CHECKERBOARD, 0.0, (0.1, 0.1), 0)
+    image = cv2.warpAffine(drawn.image, np.array([[1.0, 0, shift[0]], [0, 1, shift[1]]]), SIZE)
+    pixels = drawn.pixels + shift
+    inside = ((pixels >= 0) & (pixels <= np.array(SIZE) - 1)).all(axis=1)
+    assert 10 < inside.sum() < len(pixels)
+    found = fit_pattern(image, CHECKERBOARD.points[inside, :2], pixels[inside] + 0.2, (0.02, 0.02))
+    edge = np.minimum(pixels[inside], np.array(SIZE) - 1 - pixels[inside]).min(axis=1)
+    assert np.abs(found - pixels[inside])[edge > 4].max() < 0.08
+    assert np.abs(found - pixels[inside]).max() < 1.0
+
+
+def test_the_same_image_gives_the_same_corners_and_the_start_is_left_alone() -> None:
+    drawn = view(APRILGRID, 0.3, (0.2, 0.1), 10)
+    known, true, reach = grid(drawn, APRILGRID, 0.0099)
+    start = true.copy()
+    first = fit_pattern(drawn.image, known, start, reach)
+    np.testing.assert_array_equal(start, true)
+    np.testing.assert_array_equal(first, fit_pattern(drawn.image, known, start, reach))
+    other = fit_pattern(drawn.image, known, true + np.array([0.3, -0.2]), reach)
+    assert np.abs(first - other).max() < 0.02  # wherever the search begins
