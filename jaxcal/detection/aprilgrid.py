@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxcal.detection.homography import apply_homography, fit_homography
 from jaxcal.detection.outliers import agreeing_corners
-from jaxcal.detection.pattern_fit import fit_pattern
+from jaxcal.detection.pattern_fit import fitted_corners
 from jaxcal.detection.refine import refine_corners
 from jaxcal.targets import AprilGrid
 
@@ -276,6 +276,5 @@ def _checked_corners(image: np.ndarray, tags: _Tags, target: AprilGrid) -> tuple
     point = np.concatenate([target.tag_points(target.first_id + int(tag)) for tag in tags.ids])
     point, board = point[stayed.ravel()], _board(target)[tags.ids][stayed]
     reach = min(_INTO_GAP * target.tag_spacing, _INTO_BORDER * _BORDER / _CELLS) * target.tag_size
-    pixels = fit_pattern(image, board, refined[stayed], (reach, reach))
-    keep = agreeing_corners(board, pixels, (image.shape[1], image.shape[0]))
+    pixels, keep = fitted_corners(image, board, refined[stayed], (reach, reach))
     return point[keep], pixels[keep]

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 
 from jaxcal.detection.homography import apply_homography, fit_homography
-from jaxcal.detection.outliers import agreeing_corners
-from jaxcal.detection.pattern_fit import fit_pattern
+from jaxcal.detection.pattern_fit import fitted_corners
 from jaxcal.detection.refine import refine_corners
 from jaxcal.targets import Charuco
 
@@ -32,8 +31,7 @@ def find_charuco(image: np.ndarray, target: Charuco) -> tuple[np.ndarray, np.nda
     refined, trusted = refine_corners(image, rough, _half_windows(rough, point, target))
     point = point[trusted]
     board, rim = target.points[point, :2], 0.5 * (target.square_size - target.marker_size)
-    pixels = fit_pattern(image, board, refined[trusted], (rim, rim))
-    keep = agreeing_corners(board, pixels, (image.shape[1], image.shape[0]))
+    pixels, keep = fitted_corners(image, board, refined[trusted], (rim, rim))
     return point[keep], pixels[keep]
 
 

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from jaxcal.detection.outliers import agreeing_corners
-from jaxcal.detection.pattern_fit import fit_pattern
+from jaxcal.detection.pattern_fit import fitted_corners
 from jaxcal.detection.refine import refine_corners
 from jaxcal.targets import Checkerboard
 
@@ -38,8 +37,7 @@ def find_checkerboard(image: np.ndarray, target: Checkerboard) -> tuple[np.ndarr
     refined, trusted = refine_corners(image, corners, _half_windows(grid).ravel())
     point = np.flatnonzero(trusted)
     board, reach = target.points[point, :2], (_REACH * (target.col_spacing or target.spacing), _REACH * target.spacing)
-    pixels = fit_pattern(image, board, refined[point], reach)
-    keep = agreeing_corners(board, pixels, (image.shape[1], image.shape[0]))
+    pixels, keep = fitted_corners(image, board, refined[point], reach)
     return point[keep], pixels[keep]
 
 

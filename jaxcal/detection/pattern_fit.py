@@ -6,7 +6,13 @@ import cv2
 import numpy as np
 from scipy.special import erf
 
-_NEIGHBOURS, _FEWEST = 14, 6  # corners that tell how the board is seen around one; a quadratic map has six coefficients
+from jaxcal.detection.board_view import BoardView, fit_view
+from jaxcal.detection.outliers import FEWEST, agreeing_with
+
+_NEIGHBOURS, _THEREABOUTS = (
+    14,
+    6,
+)  # corners around one, itself among them: that a quadratic function is fitted to; nearer
 # Half a window, px: beyond, it tells of the lens's curvature more than of the corner; below, of too little.
 _LARGEST_HALF, _SMALLEST_HALF = 10.0, 1.5
 _BLURS = (0.7, 1.4, 2.8)  # 1-sigma of an edge, px; one for the whole image,
@@ -40,13 +46,28 @@ class _Views:
         return np.stack([along, up], axis=-1) @ _turned(linear) + squares @ _turned(quadratic)
 
 
-def fit_pattern(image: np.ndarray, board: np.ndarray, pixels: np.ndarray, reach: tuple[float, float]) -> np.ndarray:
+def fitted_corners(
+    image: np.ndarray, board: np.ndarray, pixels: np.ndarray, reach: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (N, 2) as `fit_pattern` places them, px, and which of them (N,) lie where the others say they should.
+
+    Fewer than 8, which do not tell how the board is seen, stay where they are and are all kept.
+    """
+    if len(board) < FEWEST:
+        return pixels, np.ones(len(board), bool)
+    view = fit_view(board, pixels, (image.shape[1], image.shape[0]))
+    moved = pixels if view is None else fit_pattern(image, board, pixels, reach, view)
+    return moved, agreeing_with(view, board, moved)
+
+
+def fit_pattern(
+    image: np.ndarray, board: np.ndarray, pixels: np.ndarray, reach: tuple[float, float], view: BoardView
+) -> np.ndarray:
     """Corners (N, 2), px, moved to where the black and white squares that meet there fit the grey image best.
 
     `board` (N, 2), m, are their places on the board; `pixels` (N, 2) in the image, right within a pixel or so. The
-    pattern is known as far as `reach` (m; along and up the board) from a corner. A corner whose window the pattern
-    does not explain, or that would go far, stays where it is; so do all where there are too few to tell how the board
-    is seen.
+    pattern is known as far as `reach` (m; along and up the board) from a corner, and seen as `view` and the corners
+    around it say. A corner whose window the pattern does not explain, or that would go far, stays where it is.
 
     `cv2.cornerSubPix` weighs every gradient in a round window, noise included. This compares the image with the
     gradients that are expected, along the whole of the edges, as the neighbouring corners say that they are seen
@@ -54,9 +75,7 @@ def fit_pattern(image: np.ndarray, board: np.ndarray, pixels: np.ndarray, reach:
     (Baker & Matthews 2004, "Lucas-Kanade 20 years on", section 3.2: inverse compositional), jointly with contrast,
     brightness, and a gradient of the light.
     """
-    if len(board) < _FEWEST:
-        return pixels
-    views = _views(board, pixels)
+    views = _views(board, pixels, view)
     along, up, half_px = _half_windows(image, views, pixels, reach)
     rows = np.flatnonzero(np.isfinite(views.inverse).all(axis=(1, 2)) & (half_px >= _SMALLEST_HALF))
     if not len(rows):
@@ -149,29 +168,37 @@ class _Template:
         return corners, found[:, 0] ** 2 * pattern.var(axis=1) / np.maximum(seen.var(axis=1), 1e-6)
 
 
-def _views(board: np.ndarray, pixels: np.ndarray) -> _Views:
-    """By quadratic functions fitted to each corner's neighbours, the nearer the more they count."""
+def _views(board: np.ndarray, pixels: np.ndarray, view: BoardView) -> _Views:
+    """The board as seen around each corner: a quadratic function of the neighbours alone, or `view` with one of what
+    departs from it, whichever tells better where corners thereabouts are.
+
+    At the rim of the board, where all neighbours are on one side, quadratic functions alone are off by a hundredth of
+    a pixel, outwards all around; `view`, which bends as most lenses do, is off by more in the widest ones.
+    """
     distance = np.linalg.norm(board[:, None] - board, axis=2)
     near = np.argsort(distance, axis=1, kind="stable")[:, :_NEIGHBOURS]
     unit = np.take_along_axis(distance, near, axis=1)[:, -1] * 1.05
     u = (board[near] - board[:, None]) / unit[:, None, None]
     weight = np.maximum(1.0 - np.sum(u**2, axis=2), 0.05)
     weight[:, 0] = 0.0  # the corner itself, which may be out of place
-    terms = np.stack(
-        [np.ones_like(weight), u[..., 0], u[..., 1], 0.5 * u[..., 0] ** 2, u[..., 0] * u[..., 1], 0.5 * u[..., 1] ** 2],
-        axis=-1,
-    )
-    normal = _turned(terms * weight[..., None]) @ terms
+    x, y = u[..., 0], u[..., 1]
+    terms = np.stack([np.ones_like(x), x, y, 0.5 * x**2, x * y, 0.5 * y**2], axis=-1)
+    weighted = _turned(terms * weight[..., None])
     # Neighbours that all lie in two rows leave the curvature across them open: it is none then.
-    normal += 1e-4 * weight.sum(axis=1)[:, None, None] * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
-    normal += 1e-12 * weight.sum(axis=1)[:, None, None] * np.eye(6)
-    fitted = _turned(np.linalg.solve(normal, _turned(terms * weight[..., None]) @ pixels[near]))
-    linear = fitted[..., 1:3] / unit[:, None, None]
-    determinant = np.linalg.det(linear)
-    flat = np.abs(determinant) < 1e-3 * np.sum(linear**2, axis=(1, 2))  # seen edge-on, or all in one row
+    ridge = np.diag([1e-12, 1e-12, 1e-12, 1e-4, 1e-4, 1e-4])
+    normal = weighted @ terms + weight.sum(axis=1)[:, None, None] * ridge
+    shown, (first, second) = view.pixels(board), view.derivatives(board)
+    values = np.concatenate([pixels, pixels - shown], axis=1)
+    fitted = _turned(np.linalg.solve(normal, weighted @ values[near])).reshape(len(board), 2, 2, 6)
+    missed = np.sum((fitted[..., 0] - values.reshape(-1, 2, 2)) ** 2, axis=2)
+    by_view = np.diff(np.median(missed[near[:, :_THEREABOUTS]], axis=1)) <= 0.0
+    fitted = np.where(by_view[..., None], fitted[:, 1], fitted[:, 0])
+    shown, first, second = (np.where(by_view.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in (shown, first, second))
+    linear = first + fitted[..., 1:3] / unit[:, None, None]
+    flat = np.abs(np.linalg.det(linear)) < 1e-3 * np.sum(linear**2, axis=(1, 2))  # seen edge-on, or all in one row
     inverse = np.full_like(linear, np.nan)
     inverse[~flat] = np.linalg.inv(linear[~flat])
-    return _Views(fitted[..., 0], linear, inverse, fitted[..., 3:] / unit[:, None, None] ** 2)
+    return _Views(shown + fitted[..., 0], linear, inverse, second + fitted[..., 3:] / unit[:, None, None] ** 2)
 
 
 def _half_windows(

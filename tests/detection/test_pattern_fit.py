@@ -8,10 +8,13 @@ import pytest
 from drawn_boards import View, board_to_pixel, draw_aprilgrid, draw_charuco, draw_checkerboard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from jaxcal import AprilGrid, Checkerboard
+from jaxcal import AprilGrid, CameraModel, Checkerboard
+from jaxcal.cameras import PinholeEquidistant, PinholeRadtan
 from jaxcal.detection import find_corners
-from jaxcal.detection.pattern_fit import fit_pattern
+from jaxcal.detection.board_view import fit_view
+from jaxcal.detection.pattern_fit import _views, fitted_corners
 from jaxcal.detection.refine import refine_corners
 from jaxcal.targets import Charuco, Target
 
@@ -19,6 +22,8 @@ SIZE = (480, 360)
 CHECKERBOARD = Checkerboard(rows=6, cols=7, spacing=0.05)
 APRILGRID = AprilGrid(4, 5, 0.055, 0.3)
 CHARUCO = Charuco(6, 7, 0.06, 0.045, "DICT_4X4_50")
+RADTAN = PinholeRadtan.create((300.0, 300.0, 239.5, 179.5), (-0.3, 0.1, 0.0, 0.0))
+FISHEYE = PinholeEquidistant.create((150.0, 150.0, 239.5, 179.5), (-0.05, 0.04, -0.08, 0.05))
 DRAW: dict[type, Callable[..., View]] = {
     Checkerboard: draw_checkerboard,
     AprilGrid: draw_aprilgrid,
@@ -33,6 +38,10 @@ def view(board: Target, roll: float, tilt: tuple[float, float], noise: float, di
 
 def rms(errors: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+def fit_pattern(image: np.ndarray, board: np.ndarray, pixels: np.ndarray, reach: tuple[float, float]) -> np.ndarray:
+    return fitted_corners(image, board, pixels, reach)[0]
 
 
 def grid(drawn: View, board: Target, reach: float = 0.02) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
@@ -149,3 +158,35 @@ def test_the_same_image_gives_the_same_corners_and_the_start_is_left_alone() -> 
     np.testing.assert_array_equal(first, fit_pattern(drawn.image, known, start, reach))
     other = fit_pattern(drawn.image, known, true + np.array([0.3, -0.2]), reach)
     assert np.abs(first - other).max() < 0.02  # wherever the search begins
+
+
+@given(
+    lens=st.sampled_from([RADTAN, FISHEYE]),
+    turn=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-1.0, 1.0)),
+    place=st.tuples(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(0.25, 0.6)),
+)
+@settings(deadline=None, max_examples=40)
+def test_edges_bend_as_the_lens_bends_them(
+    lens: CameraModel, turn: tuple[float, float, float], place: tuple[float, float, float]
+) -> None:
+    """What would move a corner is a wrong bend, to the same side on either side of it; at the board's rim, too."""
+    R = Rotation.from_rotvec(turn).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    board = CHECKERBOARD.points[:, :2]
+
+    def seen(places: np.ndarray) -> np.ndarray:
+        points = np.column_stack([places, np.zeros(len(places))]) - CHECKERBOARD.points.mean(axis=0)
+        return np.asarray(lens.project(points @ R.T + np.array(place)))
+
+    true = seen(board)
+    view = fit_view(board, true, SIZE)
+    assert view is not None
+    views = _views(board, true, view)
+    reach = 0.4 * CHECKERBOARD.spacing
+    scale = np.minimum(1.0, 10.0 / (reach * np.linalg.norm(views.linear, axis=1).max(axis=1)))
+    wrong = []
+    for along, up in ((1, 0), (0, 1), (1, 1), (1, -1)):
+        step = reach * scale[:, None] * np.array([along, up])
+        bend = views.offsets(step[:, :1], step[:, 1:])[:, 0] + views.offsets(-step[:, :1], -step[:, 1:])[:, 0]
+        wrong.append(np.linalg.norm(bend - (seen(board + step) + seen(board - step) - 2 * true), axis=1))
+    # A corner moves by a sixth of it. Few corners, at the rim, in a lens that bends more and more, see more of it.
+    assert np.max(wrong) < 0.06 or (lens is FISHEYE and np.median(wrong) < 0.06)
