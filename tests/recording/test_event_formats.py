@@ -102,6 +102,20 @@ def test_text_round_trip(folder: Path, events: Stream, style: str, block: int) -
         assert_reads(write_text(folder / "file.txt", events, style), events)
 
 
+def test_a_text_read_in_parts_has_the_same_blocks(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pass that went on where another had stopped once cut its blocks elsewhere: events were given twice."""
+    events = stream(np.arange(300) * 997)
+    path = write_text(folder / "file.txt", events, "seconds")
+    for block in (30, 100, 257, 1000):
+        monkeypatch.setattr(text, "BLOCK_BYTES", block)
+        for middle in range(0, 300_000, 39_000):
+            with EventFile(path, WIDTH, HEIGHT) as file:
+                file.window(middle * 1000, (middle + 20_000) * 1000)
+                assert len(file) == 300
+                windows = [part.t_ns for _, part in file.windows(50_000_000)]
+                assert np.array_equal(np.concatenate(windows), events.t * 1000)
+
+
 @pytest.mark.parametrize("kind", ["npz", "npz compressed", "aedat4"])
 @given(events=streams(st.integers(0, 2_000_000_000_000_000), TWO_SECONDS), block=st.integers(1, 60))
 @settings(quick, max_examples=20)

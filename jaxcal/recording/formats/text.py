@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -71,24 +71,27 @@ def _blocks(path: Path, layout: _Layout, resume: Any) -> Iterator[Block]:
     roles = np.array([named.get(name, text_lines.IGNORED) for name in layout.columns], np.int64)
     offset, line, _ = (layout.body, layout.line, False) if resume is None else resume
     with path.open("rb") as file:
-        file.seek(offset)
-        rest = b""
-        while True:
-            content = file.read(BLOCK_BYTES)
-            at_end = not content
-            lines = rest + (content or (b"\n" if rest else b""))
-            cut = lines.rfind(b"\n") + 1
-            lines, rest = lines[:cut], lines[cut:]
-            if lines:
-                events, count, bad = _parsed(text_lines.parse, lines, roles, layout.exponent)
-                broken_off = bad >= 0 and at_end and lines.count(b"\n", bad) == 1
-                if bad >= 0 and not broken_off:
-                    found = lines[bad : bad + 80].split(b"\n")[0].decode("utf-8", "replace").strip()
-                    raise CalibrationError(f"{path}: line {line + count} is '{found}'. {_EXPECTED}")
-                offset, line = offset + len(lines), line + count
-                yield Block(events, (offset, line, broken_off))
-            if at_end:
-                return
+        while lines := _lines_from(file, offset):
+            unterminated = not lines.endswith(b"\n")  # then they are the file's last
+            lines += b"\n" if unterminated else b""
+            events, count, bad = _parsed(text_lines.parse, lines, roles, layout.exponent)
+            broken_off = bad >= 0 and unterminated and lines.count(b"\n", bad) == 1
+            if bad >= 0 and not broken_off:
+                found = lines[bad : bad + 80].split(b"\n")[0].decode("utf-8", "replace").strip()
+                raise CalibrationError(f"{path}: line {line + count} is '{found}'. {_EXPECTED}")
+            offset, line = offset + len(lines), line + count
+            yield Block(events, (offset, line, broken_off))
+
+
+def _lines_from(file: BinaryIO, offset: int) -> bytes:
+    """The lines of the next block, which follow from where it starts alone: a pass that resumes there finds the same
+    blocks as one that has come from the start. The file's last line may lack its end."""
+    file.seek(offset)
+    content = file.read(BLOCK_BYTES)
+    if len(content) < BLOCK_BYTES:
+        return content
+    cut = content.rfind(b"\n") + 1
+    return content[:cut] if cut else content + file.readline()
 
 
 def _parsed(parse: Any, lines: bytes, roles: np.ndarray, exponent: int) -> tuple[EventColumns, int, int]:
