@@ -191,8 +191,9 @@ def _views(board: np.ndarray, pixels: np.ndarray, view: BoardView) -> _Views:
     values = np.concatenate([pixels, pixels - shown], axis=1)
     fitted = _turned(np.linalg.solve(normal, weighted @ values[near])).reshape(len(board), 2, 2, 6)
     missed = np.sum((fitted[..., 0] - values.reshape(-1, 2, 2)) ** 2, axis=2)
-    by_view = np.diff(np.median(missed[near[:, :_THEREABOUTS]], axis=1)) <= 0.0
-    fitted = np.where(by_view[..., None], fitted[:, 1], fitted[:, 0])
+    alone, with_view = np.median(missed[near[:, :_THEREABOUTS]], axis=1).T
+    by_view = with_view <= alone
+    fitted = np.where(by_view[:, None, None], fitted[:, 1], fitted[:, 0])
     shown, first, second = (np.where(by_view.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in (shown, first, second))
     linear = first + fitted[..., 1:3] / unit[:, None, None]
     flat = np.abs(np.linalg.det(linear)) < 1e-3 * np.sum(linear**2, axis=(1, 2))  # seen edge-on, or all in one row
