@@ -171,7 +171,7 @@ def rows_of(name: str, calibration: jaxcal.Calibration, seconds: float) -> list[
     rows = []
     for camera in calibration.cameras:
         values, sigmas = np.asarray(camera.model.intrinsics), calibration.std(f"{camera.name}.intrinsics")
-        lens = ", ".join(f"{v:.2f} ± {s:.2f}" for v, s in zip(values, sigmas, strict=True))
+        lens = ", ".join(f"{v:.3f} ± {s:.3f}" for v, s in zip(values, sigmas, strict=True))
         offset = "-"
         if camera.timeshift_cam_imu is not None:
             sigma = calibration.std(f"{camera.name}.timeshift_cam_imu")[0]
