@@ -52,8 +52,8 @@ def fit_view(board: np.ndarray, pixels: np.ndarray, image_size: tuple[int, int])
     """The view that corners at `board` (N, 2), m, and `pixels` (N, 2) show, N >= 8; None where they are no view of a
     plane. Fitted with a loss that grows linearly, so that corners out of place do not bend it."""
     middle, centre = board.mean(axis=0), np.array(image_size) / 2.0 - 0.5
-    size = float(np.abs(board - middle).max())
-    unit = np.column_stack([(board - middle) / max(size, 1e-12), np.ones(len(board))])
+    size = max(float(np.abs(board - middle).max()), 1e-12)
+    unit = np.column_stack([(board - middle) / size, np.ones(len(board))])
     reach = float(np.linalg.norm(pixels - centre, axis=1).max())
     seen = (pixels - centre) / reach
     homography, _ = cv2.findHomography(unit[:, :2], seen, cv2.LMEDS)

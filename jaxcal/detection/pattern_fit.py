@@ -9,10 +9,8 @@ from scipy.special import erf
 from jaxcal.detection.board_view import BoardView, fit_view
 from jaxcal.detection.outliers import FEWEST, agreeing_with
 
-_NEIGHBOURS, _THEREABOUTS = (
-    14,
-    6,
-)  # corners around one, itself among them: that a quadratic function is fitted to; nearer
+_NEIGHBOURS = 14  # corners, itself among them, that a quadratic function around one is fitted to
+_THEREABOUTS = 6  # of which so many tell whether it is a good one
 # Half a window, px: beyond, it tells of the lens's curvature more than of the corner; below, of too little.
 _LARGEST_HALF, _SMALLEST_HALF = 10.0, 1.5
 _BLURS = (0.7, 1.4, 2.8)  # 1-sigma of an edge, px; one for the whole image,
@@ -81,7 +79,7 @@ def fit_pattern(
     if not len(rows):
         return pixels
     views, start, half_px = views.take(rows), pixels[rows], half_px[rows]
-    line = np.linspace(-1.0, 1.0, 2 * int(np.ceil(np.median(half_px))) + 1)  # a sample in a pixel, or nearly
+    line = np.linspace(-1.0, 1.0, 2 * int(np.ceil(np.median(half_px))) + 1)  # about a sample in a pixel
     places = along[rows, None] * line, up[rows, None] * line
     grey = image.astype(np.float32)
     template = _Template.of(views, *places, _blur(grey, start, views, *places))
