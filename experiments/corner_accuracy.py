@@ -9,18 +9,15 @@ guess: what is compared is the last step alone.
 """
 
 import argparse
-import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from paper_scenes import README, markdown
+from paper_scenes import into_readme, markdown
 from scipy.spatial.transform import Rotation
 
-from jaxcal.atomic import write_text
 from jaxcal.cameras import CameraModel, PinholeEquidistant, PinholeRadtan
 from jaxcal.detection import find_corners
 from jaxcal.detection.refine import refine_corners
@@ -84,7 +81,7 @@ def main() -> int:
     table = markdown([*header, "ratio", "jaxcal, rms", "largest"], rows)
     print(table)
     if options.readme:
-        _into_readme(table)
+        into_readme("corners", table)
     return 0
 
 
@@ -123,12 +120,6 @@ def _half_windows(view: View, target: Target, point: np.ndarray) -> np.ndarray:
     if isinstance(target, Charuco):
         nearest *= 0.5 * (1.0 - target.marker_size / target.square_size) / 0.4
     return np.clip(np.floor(0.4 * nearest), 2, 9).astype(np.int64)
-
-
-def _into_readme(table: str) -> None:
-    text = Path(README).read_text()
-    filled = f"<!-- corners -->\n{table}\n<!-- /corners -->"
-    write_text(README, re.sub(r"<!-- corners -->.*<!-- /corners -->", lambda _: filled, text, flags=re.S))
 
 
 if __name__ == "__main__":

@@ -279,12 +279,17 @@ def publish(options: argparse.Namespace, name: str, table: str, numbers: Any) ->
     write_text(options.work / f"{name}.md", table + "\n")
     print(table)
     if options.readme:
-        filled = f"<!-- {name} -->\n{table}\n<!-- /{name} -->"
-        text = README.read_text()
-        if f"<!-- {name} -->" not in text:
-            print(f"error: {README} has no place <!-- {name} --> for the table.", file=sys.stderr)
-            return
-        write_text(README, re.sub(rf"<!-- {name} -->.*<!-- /{name} -->", lambda _: filled, text, flags=re.S))
+        into_readme(name, table)
+
+
+def into_readme(name: str, table: str) -> None:
+    """Put a table into its place in the README, between the comments of that name."""
+    text = README.read_text()
+    if f"<!-- {name} -->" not in text:
+        print(f"error: {README} has no place <!-- {name} --> for the table.", file=sys.stderr)
+        return
+    filled = f"<!-- {name} -->\n{table}\n<!-- /{name} -->"
+    write_text(README, re.sub(rf"<!-- {name} -->.*<!-- /{name} -->", lambda _: filled, text, flags=re.S))
 
 
 def markdown(header: list[str], rows: Iterable[Iterable[str]]) -> str:
