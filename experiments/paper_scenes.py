@@ -24,9 +24,10 @@ import jaxcal
 from jaxcal.atomic import write_text
 from jaxcal.cameras import CameraModel, Pinhole, PinholeEquidistant, PinholeRadtan
 from jaxcal.detection import detect
-from jaxcal.observations import Detections, Events, Frames
+from jaxcal.observations import Detections, Frames
 from jaxcal.progress import Progress, track
 from jaxcal.recording import load_frames, load_rig
+from jaxcal.recording.windows import TimedWindows, Window
 from jaxcal.simulation import EventSensorConfig, Imaging, SimulatedCamera, SimulatedRig, paper_rig, write_recording
 from jaxcal.simulation.measurements import T_cam_target, project_points
 from jaxcal.simulation.recordings import fingerprint
@@ -55,8 +56,8 @@ _VELOCITY_STEP_S = 1e-4
 # The built-in rig's motion, slowed down: near the wide lens and its edges most corners then move at 0 to 400 px/s.
 _PACE = 0.5
 
-# Events in windows, as (end in ns, events), to images, as (end in ns, uint8 (H, W)).
-FrameMaker = Callable[[Iterable[tuple[int, Events]], int, int], Iterator[tuple[int, np.ndarray]]]
+# Windows of events, and the sensor's width and height, to images, as (time in ns, uint8 (H, W)).
+FrameMaker = Callable[[Iterable[Window], int, int], Iterator[tuple[int, np.ndarray]]]
 
 
 @dataclass(frozen=True)
@@ -135,14 +136,20 @@ def scene(
 # --- frames and corners ----------------------------------------------------------------------------------------------
 
 
-def made_frames(recording: Recording, method: str, key: str, maker: FrameMaker, progress: Progress) -> Frames:
-    """The frames that `maker` makes of the events, one per ideal frame; kept under the name `method` and `key`."""
+def made_frames(
+    recording: Recording, method: str, key: str, maker: FrameMaker, progress: Progress, shown_at: float = 1.0
+) -> Frames:
+    """The frames that `maker` makes of the events, one per ideal frame; kept under the name `method` and `key`.
+
+    `shown_at`: which moment of its window an image shows, as `WindowPlan.showing` takes it.
+    """
     times = recording.ideal_frames().timestamps_ns
     path = recording.folder / f"frames-{method}-{hashlib.sha256(key.encode()).hexdigest()[:12]}.npz"
     if not path.exists():
         rig = load_rig(recording.folder / "rig.yaml")
         with rig.cameras[0].open_events() as events:
-            made = maker(events.windows_ending(times.tolist()), events.width, events.height)
+            plan = TimedWindows(times, np.full(len(times), True)).showing(shown_at)
+            made = maker(plan.windows(events), events.width, events.height)
             images = [image for _, image in track(made, f"{method} frames", len(times), progress)]
         part = path.with_suffix(".part")
         with part.open("wb") as file:
@@ -162,10 +169,10 @@ def network_frames(recording: Recording, network: str | None, progress: Progress
         weights.update(value.numpy().tobytes())
     key = json.dumps([weights.hexdigest(), loaded.settings])
 
-    def maker(windows: Iterable[tuple[int, Events]], width: int, height: int) -> Iterator[tuple[int, np.ndarray]]:
+    def maker(windows: Iterable[Window], width: int, height: int) -> Iterator[tuple[int, np.ndarray]]:
         return reconstruction.reconstruct(windows, loaded, width=width, height=height)
 
-    return made_frames(recording, "network", key, maker, progress)
+    return made_frames(recording, "network", key, maker, progress, loaded.shown_at)
 
 
 def corners(recording: Recording, frames: Frames, name: str, progress: Progress) -> Detections:

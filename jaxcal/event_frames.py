@@ -56,9 +56,10 @@ def event_frames(
     stage: str = "reconstruct",
     progress: Progress = no_progress,
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """The frames that `plan` wants, as they become ready: (t_ns, image), t_ns the end of the frame's window."""
+    """The frames that `plan` wants, as they become ready: (t_ns, image), t_ns the moment that the image shows."""
     import reconstruction  # imports torch, which takes seconds: only where there are events
 
+    plan = plan.showing(network.shown_at)
     options = dict(options)
     if isinstance(options.get("hot_pixels"), str) and options["hot_pixels"] == AUTOMATIC:
         hot = find_hot_pixels(events, progress)
@@ -66,7 +67,7 @@ def event_frames(
     total, done = plan.count(events), 0
     progress(stage, 0, total)
 
-    def reported() -> Iterator[tuple[int, Any, bool]]:
+    def reported() -> Iterator[tuple[int, Any, bool, int]]:
         nonlocal done
         for window in plan.windows(events):
             yield window

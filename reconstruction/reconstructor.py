@@ -18,7 +18,7 @@ from reconstruction import voxel_torch
 from reconstruction.colour import bayer_places, merged
 from reconstruction.networks import ReconstructionNetwork
 from reconstruction.networks.base import State
-from reconstruction.voxel import RunningScale, accumulate, normalise
+from reconstruction.voxel import RunningScale, accumulate, normalise, window_time
 
 logger = logging.getLogger(__name__)
 
@@ -109,9 +109,18 @@ class Reconstructor:
         self._scaled = RunningScale() if self.network.scaling == "running" else normalise
 
     def __call__(
-        self, x: np.ndarray, y: np.ndarray, t_us: np.ndarray, p: np.ndarray
+        self,
+        x: np.ndarray,
+        y: np.ndarray,
+        t_us: np.ndarray,
+        p: np.ndarray,
+        span_us: tuple[float, float, float] | None = None,
     ) -> UInt8[np.ndarray, "{self.height} {self.width} *channels"]:
-        """The image at the end of a window of events, uint8 (H, W), in colour (H, W, 3); arguments as for `voxel_grid`.
+        """The image of a window of events, uint8 (H, W), in colour (H, W, 3); arguments as for `voxel_grid`.
+
+        `span_us`: the window's start, the moment that the image is to show, and its end, on the clock of `t_us`. Only
+        networks whose `shown_at` is not 1 need it, E2VID's show the end in any case; without it the window is that from
+        the first event to the last one.
 
         A window without events says that nothing changed: the last image is given again (grey before the first), and
         the state stays as it is.
@@ -122,7 +131,10 @@ class Reconstructor:
             return grey if self._last_image is None else self._last_image.copy()
         self._notice_jump(float(np.min(t_us)), float(np.max(t_us)))
         with torch.inference_mode():
-            voxels = self._voxels(x, y, t_us, p)
+            if span_us is None:
+                span_us = _span(t_us, self.network.shown_at)
+            time, span = window_time(t_us, span_us, self.network.shown_at)
+            voxels = self._voxels(x, y, time, p, span)
             image = self._tone(self._plane, voxels)
             if self._colours:
                 planes = {
@@ -142,13 +154,13 @@ class Reconstructor:
         self._last_us = last_us
 
     def _voxels(
-        self, x: np.ndarray, y: np.ndarray, t_us: np.ndarray, p: np.ndarray
+        self, x: np.ndarray, y: np.ndarray, t_us: np.ndarray, p: np.ndarray, span: tuple[float, float] | None
     ) -> Float[torch.Tensor, "bins {self.height} {self.width}"]:
         size: dict[str, int] = {"width": self.width, "height": self.height, "num_bins": self.network.num_bins}
         raw = self.no_normalize or self.network.scaling == "none"
         if self.device.type == "cuda" and self.network.scaling != "running":
-            return self._voxels_on_gpu(voxel_torch.accumulate(x, y, t_us, p, **size, device=self.device), raw)
-        grid = accumulate(x, y, t_us, p, **size)
+            return self._voxels_on_gpu(voxel_torch.accumulate(x, y, t_us, p, **size, device=self.device, span=span), raw)
+        grid = accumulate(x, y, t_us, p, **size, span=span)
         if self._working_cells is not None:
             grid = grid * self._working_cells
         if self.flip:
@@ -193,8 +205,9 @@ class Plane:
         """The image, with its padding, in float32."""
         padded = _pad(voxels[None], self.padding, self.network.padding)
         precision: AbstractContextManager = nullcontext()
-        if self.dtype is not None:
+        if self.network.reduced_precision:  # one of ours; up to four times as quick in this layout
             padded = padded.contiguous(memory_format=torch.channels_last)
+        if self.dtype is not None:
             precision = torch.autocast(self.device_type, self.dtype)
         with precision:
             image, state = self.network(padded, self.state)
@@ -228,6 +241,11 @@ class ToneCurve:
         self._recent.append((low, high))
         lows, highs = zip(*self._recent, strict=True)
         return float(np.median(lows)), float(np.median(highs))
+
+
+def _span(t_us: np.ndarray, shown_at: float) -> tuple[float, float, float]:
+    first, last = float(np.min(t_us)), float(np.max(t_us))
+    return first, first + shown_at * (last - first), last
 
 
 def unsharp_kernel(sigma: float, size: int = 5) -> Float[torch.Tensor, "1 1 size size"]:

@@ -12,7 +12,7 @@ from reconstruction.reconstructor import Reconstructor
 
 
 def reconstruct(
-    windows: Iterable[tuple[int, Events] | tuple[int, Events, bool]],
+    windows: Iterable[tuple[int, Events] | tuple[int, Events, bool] | tuple[int, Events, bool, int]],
     network: ReconstructionNetwork,
     *,
     width: int,
@@ -22,16 +22,18 @@ def reconstruct(
     """The images of one event camera, one per window, as they become ready: `(t_ns, uint8 (height, width))`.
 
     `windows` gives `(t_end_ns, events)` in order of time, each with the events since the window before; `t_ns` of an
-    image is its window's end, the moment that the image shows. A third entry says whether the image is wanted; those
-    that are not are computed, but not given. `options` are those of `Reconstructor`. Nothing is kept but the network's
-    state, whatever the recording's length.
+    image is the moment that it shows: where the network's `shown_at` puts it between the window's start and end, unless
+    a fourth entry says otherwise. A third entry says whether the image is wanted; those that are not are computed, but
+    not given. `options` are those of `Reconstructor`. Nothing is kept but the network's state, whatever the recording's
+    length.
 
-    Raises CalibrationError when windows run backwards, or hold events after their end.
+    Raises CalibrationError when windows run backwards, hold events after their end, or are to show a moment outside, or
+    another one than their end with a network that shows the end.
     """
     reconstructor = Reconstructor(network, width, height, **options)
     previous_end: int | None = None
     origin_ns: int | None = None  # of the float microseconds: since 1970 they would lose the last digits
-    for t_end_ns, events, *wanted in windows:
+    for t_end_ns, events, *more in windows:
         end = int(t_end_ns)
         if previous_end is not None and end <= previous_end:
             raise CalibrationError(
@@ -45,7 +47,18 @@ def reconstruct(
         if origin_ns is None and len(events):
             origin_ns = int(events.t_ns[0])
         t_us = (np.asarray(events.t_ns) - (origin_ns or 0)) * 1e-3
+        # The first window's start is told by nothing but its events.
+        start = previous_end if previous_end is not None else int(events.t_ns[0]) if len(events) else end
+        shown = int(more[1]) if len(more) > 1 else end - round((1.0 - network.shown_at) * (end - start))
+        if previous_end is None:
+            start = min(start, shown)
+        if shown != end and not (start <= shown < end and network.shown_at < 1.0):
+            raise CalibrationError(
+                f"Reconstruction: the window from {start} to {end} ns is to show {shown} ns, which "
+                f"{'lies outside' if network.shown_at < 1.0 else 'this network cannot: it shows the end'}."
+            )
         previous_end = end
-        image = reconstructor(events.x, events.y, t_us, events.p)
-        if not wanted or wanted[0]:
-            yield end, image
+        span_us = tuple((time - (origin_ns or 0)) * 1e-3 for time in (start, shown, end))
+        image = reconstructor(events.x, events.y, t_us, events.p, span_us)
+        if not more or more[0]:
+            yield shown, image

@@ -44,17 +44,37 @@ def accumulate(
     width: int,
     height: int,
     num_bins: int = 5,
+    span: tuple[float, float] | None = None,
 ) -> Float[np.ndarray, "bins height width"]:
-    """As `voxel_grid`, before normalisation: the sum over all cells is the number of rises minus that of falls."""
+    """As `voxel_grid`, before normalisation: the sum over all cells is the number of rises minus that of falls.
+
+    `span`: the times of the first and the last bin, in place of those of the first and the last event.
+    """
     columns, rows, times, polarity = check_events(x, y, t_us, p, width, height, num_bins)
     grid = np.zeros(num_bins * height * width, dtype=np.float32)
     if len(times):
         # Subtracted before the change of type: microseconds since 1970 need all bits of an integer.
-        since_first = (times - times.min()).astype(np.float64)
-        span = since_first.max() or 1.0
+        first, last = (times.min(), times.max()) if span is None else span
+        since_first = (times - first).astype(np.float64)
         x32, y32 = columns.astype(np.int32), rows.astype(np.int32)
-        _add_events(grid, x32, y32, since_first, polarity > 0, span, num_bins, height, width)
+        _add_events(grid, x32, y32, since_first, polarity > 0, float(last - first) or 1.0, num_bins, height, width)
     return grid.reshape(num_bins, height, width)
+
+
+def window_time(
+    t_us: np.ndarray, span_us: tuple[float, float, float], shown_at: float
+) -> tuple[np.ndarray, tuple[float, float] | None]:
+    """The times of events for a network whose image shows the moment `shown_at` of a window, and the bins' span.
+
+    `span_us` the window's start, the moment that is to be shown, and its end. The parts before and behind that moment
+    are stretched, so that it comes to lie at `shown_at` of the bins wherever in the window it is: frames may be wanted
+    at times that are not evenly spaced. Networks that show the end get times as they are, and bins from the first event
+    to the last one, as E2VID's.
+    """
+    if shown_at == 1.0:
+        return t_us, None
+    knots = np.array(span_us, dtype=np.float64)
+    return np.interp(t_us, knots, [0.0, shown_at, 1.0]), (0.0, 1.0)
 
 
 def normalise(grid: Float[np.ndarray, "bins height width"]) -> Float[np.ndarray, "bins height width"]:

@@ -21,16 +21,18 @@ def accumulate(
     height: int,
     num_bins: int,
     device: torch.device | str,
+    span: tuple[float, float] | None = None,
 ) -> Float[torch.Tensor, "bins height width"]:
     """As `reconstruction.voxel.accumulate`, on a device that has float64 and int64; the same to about 1e-7."""
     columns, rows, times, polarity = check_events(x, y, t_us, p, width, height, num_bins)
     grid = torch.zeros(num_bins * height * width, dtype=torch.int64, device=device)
     if len(times):
-        since = torch.from_numpy((times - times.min()).astype(np.float64)).to(device)
+        first, last = (times.min(), times.max()) if span is None else span
+        since = torch.from_numpy((times - first).astype(np.float64)).to(device)
         cell = torch.from_numpy(rows.astype(np.int32)).to(device).long() * width
         cell += torch.from_numpy(columns.astype(np.int32)).to(device)
         sign = torch.from_numpy(polarity > 0).to(device).double() * (2 * _UNIT) - _UNIT
-        position = (num_bins - 1) * since / (since.max().item() or 1.0)
+        position = (num_bins - 1) * since / (float(last - first) or 1.0)
         lower = position.long().clamp_(max=max(num_bins - 2, 0))
         cell += lower * (height * width)
         above = (sign * (position - lower)).round_().long()

@@ -26,7 +26,8 @@ _LONGEST, _USUAL_NS = 1.5, 50_000_000
 
 
 class Window(NamedTuple):
-    """Events since the end of the window before, and whether the image at its end is `wanted`; `t_end_ns` is exclusive.
+    """Events since the end of the window before, whether its image is `wanted`, and the moment that the image shows (as
+    a rule the window's end); `t_end_ns` is exclusive.
 
     Images that are not wanted are computed all the same: the network then sees shorter windows.
     """
@@ -34,6 +35,7 @@ class Window(NamedTuple):
     t_end_ns: int
     events: Events
     wanted: bool
+    t_shown_ns: int
 
 
 @runtime_checkable
@@ -48,6 +50,11 @@ class WindowPlan(Protocol):
         """The windows, read lazily. Each event from the start to the end of the last one is in exactly one of them."""
         ...
 
+    def showing(self, shown_at: float) -> "WindowPlan":
+        """The plan for a network whose images show another moment of their windows than the end (1), down to the
+        start (0). Plans show the end until they are asked this, once."""
+        ...
+
     def key(self) -> bytes:
         """What identifies the plan, for the events of one recording."""
         ...
@@ -56,19 +63,35 @@ class WindowPlan(Protocol):
 @dataclass(frozen=True)
 class TimedWindows:
     """Windows that end at known times: `ends_ns` (W,) int64, increasing; `wanted` (W,) bool; the first one begins at
-    `start_ns` (None: at the first event)."""
+    `start_ns` (None: at the first event). `shown_ns` (W,) the moments that the images show (None: the ends). No window is
+    to end behind `last_ns` (None: the last ones may reach beyond the recording)."""
 
     ends_ns: np.ndarray
     wanted: np.ndarray
     start_ns: int | None = None
+    shown_ns: np.ndarray | None = None
+    last_ns: int | None = None
 
     def count(self, events: EventFile) -> int:
         return len(self.ends_ns)
 
     def windows(self, events: EventFile) -> Iterator[Window]:
         windows = events.windows_ending(self.ends_ns.tolist(), self.start_ns)
-        for (t_end_ns, inside), wanted in zip(windows, self.wanted.tolist(), strict=True):
-            yield Window(t_end_ns, inside, wanted)
+        shown = self.ends_ns if self.shown_ns is None else self.shown_ns
+        for (t_end_ns, inside), wanted, t_shown_ns in zip(windows, self.wanted.tolist(), shown.tolist(), strict=True):
+            yield Window(t_end_ns, inside, wanted, t_shown_ns)
+
+    def showing(self, shown_at: float) -> "TimedWindows":
+        """The same images, of the same times, from windows that meet between these: in the middle for 0.5."""
+        if shown_at == 1.0:
+            return self
+        shown = self.ends_ns
+        steps = np.diff(shown)
+        usual = int(steps[-1]) if len(steps) else int(shown[0] - self.start_ns) if self.start_ns else _USUAL_NS
+        ends = shown + np.maximum(1, (1.0 - shown_at) * np.append(steps, usual)).astype(np.int64)
+        kept = np.full(len(ends), True) if self.last_ns is None else ends <= self.last_ns
+        count = np.flatnonzero(kept & self.wanted)[-1] + 1 if np.any(kept & self.wanted) else len(ends)
+        return replace(self, ends_ns=ends[:count], wanted=self.wanted[:count], shown_ns=shown[:count])
 
     def key(self) -> bytes:
         return f"{self.start_ns}".encode() + self.ends_ns.astype(np.int64).tobytes() + self.wanted.tobytes()
@@ -86,6 +109,7 @@ class CountedWindows:
     number: int
     parts: int = 1
     span_ns: tuple[int, int] | None = None
+    shown_at: float = 1.0
 
     @property
     def _part(self) -> int:
@@ -95,14 +119,19 @@ class CountedWindows:
         return max(1, events.rough_count() // self._part)
 
     def windows(self, events: EventFile) -> Iterator[Window]:
-        waiting: tuple[int, Events] | None = None  # held back: the last window is wanted, wherever it falls
-        index = 0
-        for window in events.windows_of(self._part, *(self.span_ns or (None, None))):
+        waiting: Window | None = None  # held back: the last window is wanted, wherever it falls
+        start = None
+        for index, (end, inside) in enumerate(events.windows_of(self._part, *(self.span_ns or (None, None)))):
             if waiting is not None:
-                yield Window(*waiting, wanted=index % self.parts == 0)
-            waiting, index = window, index + 1
+                yield waiting
+            start = int(inside.t_ns[0]) if start is None else start
+            shown = end - round((1.0 - self.shown_at) * (end - start))
+            waiting, start = Window(end, inside, (index + 1) % self.parts == 0, shown), end
         if waiting is not None:
-            yield Window(*waiting, wanted=True)
+            yield waiting._replace(wanted=True)
+
+    def showing(self, shown_at: float) -> "CountedWindows":
+        return replace(self, shown_at=shown_at)
 
     def key(self) -> bytes:
         return f"{self.number} events in {self.parts} of {self.span_ns}".encode()
@@ -223,7 +252,7 @@ def periodic(
             f"{events.path}: the recording is {(stop - start) * 1e-6:.1f} ms long, shorter than "
             f"one window of {float(period_ns) * 1e-6:g} ms. Record for longer: 20 s and more make a good calibration."
         )
-    return _divided(ends, np.full(len(ends), upsample_rate), start, span_ns)
+    return replace(_divided(ends, np.full(len(ends), upsample_rate), start, span_ns), last_ns=stop + 1)
 
 
 def at_times(

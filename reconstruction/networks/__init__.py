@@ -4,6 +4,7 @@ from reconstruction.networks.base import ReconstructionNetwork
 from reconstruction.networks.e2vid import E2VID, E2VIDRecurrent
 from reconstruction.networks.firenet import FireNet
 from reconstruction.networks.folded import FoldedFireNet
+from reconstruction.networks.two_scale import TwoScaleNet
 
 # Architecture name in a checkpoint -> class, built from the checkpoint's settings.
 ARCHITECTURES: dict[str, type[ReconstructionNetwork]] = {
@@ -11,6 +12,15 @@ ARCHITECTURES: dict[str, type[ReconstructionNetwork]] = {
     "E2VIDRecurrent": E2VIDRecurrent,
     "FireNet": FireNet,
     "FoldedFireNet": FoldedFireNet,
+    "TwoScaleNet": TwoScaleNet,
 }
 
-__all__ = ["ARCHITECTURES", "E2VID", "E2VIDRecurrent", "FireNet", "FoldedFireNet", "ReconstructionNetwork"]
+__all__ = [
+    "ARCHITECTURES",
+    "E2VID",
+    "E2VIDRecurrent",
+    "FireNet",
+    "FoldedFireNet",
+    "ReconstructionNetwork",
+    "TwoScaleNet",
+]

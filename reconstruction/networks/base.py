@@ -17,7 +17,8 @@ class ReconstructionNetwork(nn.Module, abc.ABC):
     `settings`: the numbers and names it was built from, as they stand in a checkpoint; `reduced_precision`: whether
     it was trained to work in bfloat16; `scaling` of the voxel grids that it was trained on: 'window' (each brought to
     mean 0 and deviation 1, as E2VID's), 'running' (`reconstruction.voxel.RunningScale`) or 'none'; `padding`: what
-    surrounds an input that is too small, 'reflect' or 'zeros'.
+    surrounds an input that is too small, 'reflect' or 'zeros'; `shown_at`: which moment of the window the image shows,
+    from 0 (its start) to 1 (its end, as E2VID's).
     """
 
     num_bins: int
@@ -26,10 +27,11 @@ class ReconstructionNetwork(nn.Module, abc.ABC):
     reduced_precision: bool = False
     scaling: str = "window"
     padding: str = "reflect"
+    shown_at: float = 1.0
 
     @abc.abstractmethod
     def forward(self, voxels: torch.Tensor, state: State | None) -> tuple[torch.Tensor, State]:
-        """Image (B, 1, H, W), dark 0 to bright 1, at the end of the window, and the state for the next one.
+        """Image (B, 1, H, W), dark 0 to bright 1, at the moment `shown_at` of the window, and the state for the next one.
 
         `voxels` (B, num_bins, H, W) scaled voxel grids; `state` None at the start of a recording.
         """

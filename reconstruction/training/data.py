@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxcal.progress import Progress, no_progress, track
 from reconstruction.training.recipe import DataRecipe, Stage, fingerprint
 from reconstruction.training.sequences import training_scene, windows
-from reconstruction.voxel import RunningScale, accumulate, normalise
+from reconstruction.voxel import RunningScale, accumulate, normalise, window_time
 
 logger = logging.getLogger(__name__)
 
@@ -71,9 +71,9 @@ def _generate(recipe: DataRecipe, num_bins: int, index: int, path: Path) -> None
     scaled = RunningScale() if recipe.scaling == "running" else normalise
     voxels, targets = [], []
     for window in windows(scene, seed=index):
-        grid = accumulate(
-            window.x, window.y, window.t_us, window.p, width=recipe.size, height=recipe.size, num_bins=num_bins
-        )
+        size = {"width": recipe.size, "height": recipe.size, "num_bins": num_bins}
+        time, span = window_time(window.t_us, window.span_us, recipe.shown_at)
+        grid = accumulate(window.x, window.y, time, window.p, **size, span=span)
         voxels.append(scaled(grid))
         targets.append(window.target)
     partial = path.with_suffix(".part")

@@ -81,7 +81,7 @@ def evaluate(
     reconstructed, sharp = [], []
     for index, top_speed in enumerate(track(list(top_speeds), "evaluate", len(top_speeds), progress)):
         rng = np.random.default_rng([_EVALUATION_SEED, index])
-        scene = evaluation_scene(rng, windows_each, top_speed)
+        scene = evaluation_scene(rng, windows_each, top_speed, network.shown_at)
         for window, image in _images(scene, network, _EVALUATION_SEED + index, options):
             sharp.append(_measure(_eight_bits(window.target), window, scene))
             reconstructed.append(_measure(image, window, scene))
@@ -95,7 +95,7 @@ def _images(
     reconstructor = Reconstructor(network, scene.view.width, scene.view.height, **options)  # pyright: ignore[reportArgumentType]
     highest = np.array([scene.view.width - 1, scene.view.height - 1]) - 4.0
     for index, window in enumerate(windows(scene, seed)):
-        image = reconstructor(window.x, window.y, window.t_us, window.p)
+        image = reconstructor(window.x, window.y, window.t_us, window.p, window.span_us)
         inside = (window.corners > 4.0).all() and (window.corners < highest).all()
         if index >= _SETTLING_WINDOWS and inside:
             yield window, image

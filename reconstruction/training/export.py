@@ -58,7 +58,7 @@ Reconstructs grey images of calibration boards from events. `reconstruction.load
 | licence | {LICENCE} |
 | architecture | {type(network).__name__}, {parameters} parameters: {_settings(network)} |
 | input | {_input(recipe)}, any sensor size |
-| output | linear intensity at the END of the window; the board's black is at 0.05, its white at 0.95 |
+| output | linear intensity {_moment(network)}; the board's black is at 0.05, its white at 0.95 |
 
 It knows calibration boards before cluttered backgrounds, and nothing else: it is not for pictures of the world.
 
@@ -105,6 +105,12 @@ Detection ratio {evaluation.detection_ratio:.3f}. By speed of the corner:
 
 ![loss over the steps, and corner error over the speed]({path.stem}.svg)
 """
+
+
+def _moment(network: ReconstructionNetwork) -> str:
+    if network.shown_at == 1.0:
+        return "at the END of the window"
+    return f"at {network.shown_at:g} of the window, with events on either side"
 
 
 def _input(recipe: Recipe) -> str:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 
 from jaxcal.progress import Progress, no_progress
-from reconstruction.networks import FoldedFireNet, ReconstructionNetwork
+from reconstruction.networks import ARCHITECTURES, ReconstructionNetwork
 from reconstruction.networks.base import State
 from reconstruction.training.data import Dataset
 from reconstruction.training.losses import displacement_loss, image_loss
@@ -28,8 +28,8 @@ logger = logging.getLogger(__name__)
 class Run:
     """Everything that changes during training: what a checkpoint holds."""
 
-    network: FoldedFireNet
-    average: FoldedFireNet
+    network: ReconstructionNetwork
+    average: ReconstructionNetwork
     optimiser: torch.optim.Optimizer
     step: int = 0
     stage: int = 0
@@ -77,7 +77,12 @@ def train(
 
 def _start(recipe: Recipe, parent: ReconstructionNetwork | None = None) -> Run:
     torch.manual_seed(recipe.seed)
-    network = FoldedFireNet(num_bins=recipe.num_bins, channels=recipe.channels, scaling=recipe.data.scaling)
+    network = ARCHITECTURES[recipe.architecture](
+        num_bins=recipe.num_bins,
+        channels=recipe.channels,
+        scaling=recipe.data.scaling,
+        shown_at=recipe.data.shown_at,
+    )
     if parent is not None:
         network.load_state_dict(parent.state_dict())
     if recipe.precision == "bfloat16":
@@ -102,7 +107,7 @@ def _train_on_clip(run: Run, recipe: Recipe, stage: Stage, dataset: Dataset) -> 
 
 
 def _segment_loss(
-    network: FoldedFireNet,
+    network: ReconstructionNetwork,
     voxels: Float[torch.Tensor, "t b c h w"],
     targets: Float[torch.Tensor, "t b 1 h w"],
     state: State | None,

@@ -1,7 +1,7 @@
 """Simulated sequences: a moving board, the events it makes, and the image that each window should give."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -25,9 +25,9 @@ _SUPERSAMPLING = 3  # texels per pixel, and samples per pixel along each axis
 class Window:
     """One window of a sequence.
 
-    `t_us`, `x`, `y`, `p` its events, `duration_us` its length; at its end: `target` (H, W) float32 linear intensity
-    from BLACK to WHITE, `corners` (N, 2) true pixel positions of the board's corners, `velocity` (N, 2) of theirs in
-    pixels per second.
+    `t_us`, `x`, `y`, `p` its events, `duration_us` its length, `span_us` its start, the moment that its image should
+    show, and its end; at that moment: `target` (H, W) float32 linear intensity from BLACK to WHITE, `corners` (N, 2)
+    true pixel positions of the board's corners, `velocity` (N, 2) of theirs in pixels per second.
     """
 
     t_us: np.ndarray
@@ -35,6 +35,7 @@ class Window:
     y: np.ndarray
     p: np.ndarray
     duration_us: float
+    span_us: tuple[float, float, float]
     target: Float[np.ndarray, "height width"]
     corners: Float[np.ndarray, "n 2"]
     velocity: Float[np.ndarray, "n 2"]
@@ -46,7 +47,7 @@ class Scene:
 
     `travelled` (windows * samples + 1,) pixels of image motion so far, `samples` times per window of `window_us`
     microseconds; `blur_px` standard deviation of the lens's blur; `black_to_white` intensity of black over that of
-    white.
+    white; `shown_at` as `ReconstructionNetwork.shown_at`.
     """
 
     pattern: Pattern
@@ -58,6 +59,7 @@ class Scene:
     blur_px: float
     black_to_white: float
     sensor: EventSensorConfig
+    shown_at: float = 1.0
 
 
 def training_scene(rng: np.random.Generator, recipe: DataRecipe) -> Scene:
@@ -65,7 +67,7 @@ def training_scene(rng: np.random.Generator, recipe: DataRecipe) -> Scene:
     while True:
         scene = _any_training_scene(rng, recipe)
         if recipe.edge_on or _least_foreshortening(scene) > _EDGE_ON:
-            return scene
+            return replace(scene, shown_at=recipe.shown_at)
 
 
 def _any_training_scene(rng: np.random.Generator, recipe: DataRecipe) -> Scene:
@@ -103,7 +105,7 @@ def _least_foreshortening(scene: Scene) -> float:
     return float((depths.min(axis=1) / np.abs(depths).max(axis=1)).min())
 
 
-def evaluation_scene(rng: np.random.Generator, windows: int, top_speed: float) -> Scene:
+def evaluation_scene(rng: np.random.Generator, windows: int, top_speed: float, shown_at: float = 1.0) -> Scene:
     """A whole 9 x 6 checkerboard, 20 pixels or more to the cell, that stays within a 384 x 288 image."""
     cell = int(rng.uniform(21, 25) * _SUPERSAMPLING)
     pattern = checkerboard(rng, 9, 6, cell, 100 * _SUPERSAMPLING)
@@ -117,7 +119,7 @@ def evaluation_scene(rng: np.random.Generator, windows: int, top_speed: float) -
         tilt=_tilt(rng, 30.0),
         amplitude=30.0,
     )
-    return _moving(rng, pattern, view, windows, top_speed=top_speed, wobble=0.6)
+    return replace(_moving(rng, pattern, view, windows, top_speed=top_speed, wobble=0.6), shown_at=shown_at)
 
 
 def _tilt(rng: np.random.Generator, largest_deg: float) -> Float[np.ndarray, "3"]:
@@ -177,7 +179,7 @@ def windows(scene: Scene, seed: int) -> Iterator[Window]:
         part = slice(index * scene.samples, (index + 1) * scene.samples + 1)
         fastest = np.diff(scene.travelled[part]).max() * scene.samples
         steps = max(2, int(np.ceil(fastest / _PIXELS_PER_STEP)))
-        at = index + np.arange(1, steps + 1) / steps
+        at = index + np.union1d(np.arange(1, steps + 1) / steps, [scene.shown_at])
         homographies = scene.path.homographies(np.interp(at, instants, scene.travelled))
         yield _window(scene, sensor, at, homographies)
 
@@ -185,22 +187,27 @@ def windows(scene: Scene, seed: int) -> Iterator[Window]:
 def _window(
     scene: Scene, sensor: EventSensor, at: Float[np.ndarray, " n"], homographies: Float[np.ndarray, "n 3 3"]
 ) -> Window:
-    """Render and feed the images at times `at` (in windows); the last one is the window's end."""
-    events, image = [], np.empty(0)
+    """Render and feed the images at times `at` (in windows); one is the moment that is shown, the last one the end."""
+    index = round(at[-1]) - 1
+    shown = int(np.argmin(np.abs(at - index - scene.shown_at)))
+    events, images = [], []
     for time, homography in zip(at, homographies, strict=True):
         image = _render(scene, homography)
+        images.append(image)
         events.append(sensor.feed(round(time * scene.window_us * 1e3), _log_intensity(scene, image)))
     t_ns, x, y, p = (np.concatenate(arrays) for arrays in zip(*events, strict=True))
-    before, corners = apply_homography(homographies[-2:], scene.pattern.corners)
+    around = [max(shown - 1, 0), min(shown + 1, len(at) - 1)]
+    before, corners, after = apply_homography(homographies[[around[0], shown, around[1]]], scene.pattern.corners)
     return Window(
         t_us=t_ns * 1e-3,
         x=x,
         y=y,
         p=p,
         duration_us=scene.window_us,
-        target=(BLACK + (WHITE - BLACK) * image).astype(np.float32),
+        span_us=(index * scene.window_us, at[shown] * scene.window_us, at[-1] * scene.window_us),
+        target=(BLACK + (WHITE - BLACK) * images[shown]).astype(np.float32),
         corners=corners,
-        velocity=(corners - before) / ((at[-1] - at[-2]) * scene.window_us * 1e-6),
+        velocity=(after - before) / ((at[around[1]] - at[around[0]]) * scene.window_us * 1e-6),
     )
 
 

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxcal.observations import Events
+from jaxcal.recording.windows import Window
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
 
@@ -51,8 +52,8 @@ def test_images_without_a_network_show_rises_and_counts():
     baselines = module("paper_baselines")
     x, y, p = np.array([1, 1, 2]), np.array([0, 0, 1]), np.array([True, True, False])
     window = Events(np.array([10, 20, 30]), x.astype(np.uint16), y.astype(np.uint16), p, 4, 3)
-    ((end, leaky),) = baselines.leaky_integration([(40, window)], 4, 3)
-    ((_, count),) = baselines.event_count([(40, window)], 4, 3)
+    ((end, leaky),) = baselines.leaky_integration([Window(40, window, True, 40)], 4, 3)
+    ((_, count),) = baselines.event_count([Window(40, window, True, 40)], 4, 3)
     assert end == 40
     assert leaky[0, 1] == 255
     assert leaky[1, 2] < leaky[2, 3] == 128

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from jaxcal.errors import CalibrationError
-from reconstruction.networks import E2VIDRecurrent, FireNet, FoldedFireNet, ReconstructionNetwork
+from reconstruction.networks import E2VIDRecurrent, FireNet, FoldedFireNet, ReconstructionNetwork, TwoScaleNet
 from reconstruction.networks.blocks import ConvGRU
 
 SMALL = {"base_num_channels": 8, "num_encoders": 2, "num_residual_blocks": 1}
@@ -29,6 +29,7 @@ BUILDERS: list[tuple[type[ReconstructionNetwork], dict[str, Any]]] = [
     *((E2VIDRecurrent, SMALL | switches) for switches in E2VID_SWITCHES),
     *((FireNet, {"base_num_channels": 8} | switches) for switches in FIRENET_SWITCHES),
     *((FoldedFireNet, {"channels": 4, "fold": fold}) for fold in (1, 2, 4)),
+    *((TwoScaleNet, {"channels": 8, "detail": 4, "num_bins": bins}) for bins in (5, 8)),
 ]
 
 

@@ -246,6 +246,49 @@ def test_stream_gives_the_reconstructors_images_at_the_windows_ends():
         np.testing.assert_array_equal(image, reconstructor(*window))
 
 
+class _Clock(ReconstructionNetwork):
+    """Shows where in the bins the events lie: their mean bin, over the last one."""
+
+    num_bins, multiple, settings = 5, 1, {}
+    scaling = "none"
+
+    def __init__(self, shown_at: float):
+        super().__init__()
+        self.shown_at = shown_at
+
+    def forward(self, voxels: torch.Tensor, state: list | None) -> tuple[torch.Tensor, list]:
+        weight = torch.arange(5.0)[None, :, None, None] / 4
+        return (weight * voxels).sum(dim=1, keepdim=True) / voxels.sum(), []
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(1_000, 99_000), st.integers(0, 10**18))
+def test_stream_shows_the_moment_that_is_asked_for_wherever_it_is_in_the_window(shown_us: int, start_ns: int):
+    """Events at that moment lie in the middle bin of a network that shows the middle."""
+    cell = np.zeros(1, np.uint16)
+    first, then = (Events(start_ns + 1000 * np.array([t]), cell, cell, cell == 0, 1, 1) for t in (0, 10_000 + shown_us))
+    ends = [start_ns + 10_000_000, start_ns + 110_000_000]
+    windows = [(ends[0], first, True, start_ns + 5_000_000), (ends[1], then, True, ends[0] + 1000 * shown_us)]
+    images = list(reconstruction.reconstruct(windows, _Clock(0.5), width=1, height=1, unsharp_mask_amount=0.0))
+    assert [t_ns for t_ns, _ in images] == [windows[0][3], windows[1][3]]
+    assert images[1][1][0, 0] == pytest.approx(127.5, abs=1.0)
+
+
+def test_stream_tells_by_itself_when_its_images_are_of():
+    events = [Events(np.array([t]), *(np.zeros(1, np.uint16),) * 2, np.ones(1, bool), 4, 4) for t in (100, 1_000, 2_500)]
+    windows = list(zip((1_000, 2_000, 3_000), events[:1] + events[1:], strict=True))
+    for shown_at, expected in ((0.5, [550, 1_500, 2_500]), (1.0, [1_000, 2_000, 3_000])):
+        stream = reconstruction.reconstruct(windows, _Clock(shown_at), width=4, height=4)
+        assert [t_ns for t_ns, _ in stream] == expected
+
+
+@pytest.mark.parametrize(("shown_at", "moment", "words"), [(1.0, 500, "shows the end"), (0.5, 1_500, "outside")])
+def test_stream_refuses_moments_that_its_network_cannot_show(shown_at: float, moment: int, words: str):
+    events = Events(np.array([100]), *(np.zeros(1, np.uint16),) * 2, np.ones(1, bool), 4, 4)
+    with pytest.raises(CalibrationError, match=words):
+        list(reconstruction.reconstruct([(1_000, events, True, moment)], _Clock(shown_at), width=4, height=4))
+
+
 def test_stream_is_lazy():
     drawn = []
 

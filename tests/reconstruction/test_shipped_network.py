@@ -57,12 +57,13 @@ def test_card_states_what_a_fresh_measurement_gives():
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 def test_board_is_found_in_what_it_reconstructs(precision: str):
-    scene = evaluation_scene(np.random.default_rng(4), 6, top_speed=8.0)
+    network = reconstruction.load_network()
+    scene = evaluation_scene(np.random.default_rng(4), 6, top_speed=8.0, shown_at=network.shown_at)
     reconstructor = reconstruction.Reconstructor(
-        reconstruction.load_network(), scene.view.width, scene.view.height, precision=precision
+        network, scene.view.width, scene.view.height, precision=precision
     )
     for window in windows(scene, seed=4):
-        image = reconstructor(window.x, window.y, window.t_us, window.p)
+        image = reconstructor(window.x, window.y, window.t_us, window.p, window.span_us)
     corners = find_corners(image, (9, 6))
     assert corners is not None
     distance = np.linalg.norm(corners[:, None] - window.corners[None], axis=-1).min(axis=1)

@@ -1,5 +1,6 @@
 """Training: the scenes are what they claim, the loop learns, an interrupted run ends as an unbroken one does."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reconstruction.networks import FoldedFireNet
+from reconstruction.networks import ReconstructionNetwork
 from reconstruction.training import loop
 from reconstruction.training.data import Dataset, load_or_generate
 from reconstruction.training.evaluate import CornerErrors, find_corners
@@ -78,12 +79,20 @@ def test_a_checkpoint_of_another_recipe_is_not_continued(tiny_dataset: Dataset, 
     assert all(torch.equal(restarted[name], fresh[name]) for name in fresh)
 
 
-def test_training_reduces_the_loss_on_what_it_sees(tiny_dataset: Dataset, tmp_path: Path):
+@pytest.mark.parametrize("architecture", ["FoldedFireNet", "TwoScaleNet"])
+def test_training_reduces_the_loss_on_what_it_sees(tiny_dataset: Dataset, tmp_path: Path, architecture: str):
     stage = Stage(crop=32, windows=8, segments=1, batch=2, clips=60)
-    recipe = Recipe(data=TINY.data, stages=(stage,), channels=16, warm_up_steps=2, learning_rate=5e-3)
+    recipe = Recipe(
+        data=TINY.data,
+        stages=(stage,),
+        architecture=architecture,
+        channels=16,
+        warm_up_steps=2,
+        learning_rate=5e-3,
+    )
     voxels, targets = tiny_dataset.clip(np.random.default_rng(0), stage)
 
-    def loss(network: FoldedFireNet) -> float:
+    def loss(network: ReconstructionNetwork) -> float:
         with torch.no_grad():
             return loop._segment_loss(network, voxels, targets, None, 2, recipe)[0].item()
 
@@ -200,10 +209,25 @@ def test_windows_hold_their_own_events_and_a_target_between_black_and_white(seed
             assert window.t_us.max() <= (index + 1) * window.duration_us + 1
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_rendered_corners_lie_where_the_homography_says(seed: int):
+@settings(deadline=None, max_examples=10)
+@given(st.integers(0, 10**6), st.sampled_from([0.3, 0.5]))
+def test_images_of_an_earlier_moment_come_of_the_same_motion(seed: int, shown_at: float):
+    recipe = DataRecipe(size=40, windows=5)
+    ends = list(windows(training_scene(np.random.default_rng(seed), recipe), seed))
+    scene = training_scene(np.random.default_rng(seed), replace(recipe, shown_at=shown_at))
+    travelled = np.interp(np.arange(5) + shown_at, np.arange(len(scene.travelled)) / scene.samples, scene.travelled)
+    expected = apply_homography(scene.path.homographies(travelled), scene.pattern.corners)
+    for index, (window, end) in enumerate(zip(windows(scene, seed), ends, strict=True)):
+        start_us, shown_us, end_us = window.span_us
+        assert end.span_us == (start_us, end_us, end_us)
+        assert shown_us == pytest.approx(start_us + shown_at * window.duration_us)
+        np.testing.assert_allclose(window.corners, expected[index], atol=1e-6)
+
+
+@pytest.mark.parametrize(("seed", "shown_at"), [(0, 1.0), (1, 1.0), (2, 0.5)])
+def test_rendered_corners_lie_where_the_homography_says(seed: int, shown_at: float):
     """The truth that the evaluation measures against is that of the pictures, to a few hundredths of a pixel."""
-    scene = evaluation_scene(np.random.default_rng(seed), 2, top_speed=6.0)
+    scene = evaluation_scene(np.random.default_rng(seed), 2, top_speed=6.0, shown_at=shown_at)
     window = list(windows(scene, seed))[-1]
     image = np.round(255 * window.target).astype(np.uint8)
     start = window.corners.astype(np.float32).reshape(-1, 1, 2)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from jaxcal.errors import CalibrationError
 from reconstruction import voxel_grid, voxel_torch
-from reconstruction.voxel import RunningScale, accumulate, normalise
+from reconstruction.voxel import RunningScale, accumulate, normalise, window_time
 
 WIDTH, HEIGHT = 7, 5
 SIZE = {"width": WIDTH, "height": HEIGHT}
@@ -179,3 +179,40 @@ def test_running_scale_outlasts_slow_windows_and_fades():
         last = scale(np.zeros((1, 4, 4), np.float32))
     assert scale.events == 1.0
     assert np.isfinite(last).all()
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=30), st.floats(0.1, 0.9), st.floats(0.1, 0.9))
+def test_window_time_puts_the_shown_moment_where_the_network_expects_it(places: list[float], moment: float, at: float):
+    start, end = 1e15, 1e15 + 50_000.0
+    shown = start + moment * (end - start)
+    t_us = np.sort(start + (end - start) * np.array(places))
+    time, span = window_time(np.concatenate([[start, shown, end], t_us]), (start, shown, end), at)
+    assert span == (0.0, 1.0)
+    assert time[:3] == pytest.approx([0.0, at, 1.0], abs=1e-9)
+    assert np.all(np.diff(time[3:]) >= 0)
+    assert np.all((time >= 0) & (time <= 1))
+
+
+def test_networks_that_show_the_end_get_times_as_they_are():
+    t_us = np.array([3, 5, 9])
+    time, span = window_time(t_us, (0.0, 10.0, 10.0), 1.0)
+    assert time is t_us
+    assert span is None
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 2**32 - 1))
+def test_a_given_span_places_the_bins(seed: int):
+    """Bins of the window, not of its events: the same events in a span that begins earlier lie in later bins."""
+    rng = np.random.default_rng(seed)
+    x, y, p = rng.integers(0, 8, 40), rng.integers(0, 6, 40), rng.integers(0, 2, 40)
+    t = np.sort(rng.uniform(0.5, 1.0, 40))
+    size = {"width": 8, "height": 6, "num_bins": 5}
+    grid = accumulate(x, y, t, p, **size, span=(0.0, 1.0))
+    assert not grid[:2].any()
+    assert grid.sum() == pytest.approx(np.where(p > 0, 1, -1).sum(), abs=1e-4)
+    own = accumulate(x, y, t, p, **size, span=(float(t.min()), float(t.max())))
+    np.testing.assert_array_equal(own, accumulate(x, y, t, p, **size))
+    on_torch = voxel_torch.accumulate(x, y, t, p, **size, device="cpu", span=(0.0, 1.0))
+    np.testing.assert_allclose(on_torch.numpy(), grid, atol=1e-5)

@@ -113,7 +113,7 @@ def plans(draw: st.DrawFn, events: EventFile) -> WindowPlan:
 @given(st.data())
 def test_each_event_is_in_exactly_one_window(data: st.DataObject) -> None:
     events = data.draw(recordings())
-    plan = data.draw(plans(events))
+    plan = data.draw(plans(events)).showing(data.draw(st.sampled_from([1.0, 0.75, 0.5])))
     windows = list(plan.windows(events))
     all_t = events._reader.t_ns  # pyright: ignore[reportAttributeAccessIssue]
     if isinstance(plan, CountedWindows) and plan.span_ns is not None and not windows:
@@ -138,6 +138,41 @@ def test_each_event_is_in_exactly_one_window(data: st.DataObject) -> None:
         assert len(seen) == np.count_nonzero((all_t >= start) & (all_t < stop))
     else:
         assert plan.count(events) == len(windows)
+
+
+@settings(deadline=None, max_examples=80)
+@given(st.data(), st.sampled_from([0.5, 0.75]))
+def test_windows_reach_beyond_the_moments_they_show(data: st.DataObject, shown_at: float) -> None:
+    """The images are of the same times as without, but for a last one behind which nothing comes."""
+    events = data.draw(recordings())
+    plain = data.draw(plans(events))
+    before = [window for window in plain.windows(events) if window.wanted]
+    windows = list(plain.showing(shown_at).windows(events))
+    ends = [window.t_end_ns for window in windows]
+    shown = [window.t_shown_ns for window in windows]
+    assert all(window.t_shown_ns == window.t_end_ns for window in before)
+    assert all(moment < end for moment, end in zip(shown, ends, strict=True) if not isinstance(plain, CountedWindows))
+    assert all(begin <= moment for begin, moment in zip(ends[:-1], shown[1:], strict=True))
+    wanted = [window.t_shown_ns for window in windows if window.wanted]
+    if isinstance(plain, CountedWindows):
+        assert len(wanted) == len(before)
+        assert all(moment <= window.t_end_ns for moment, window in zip(wanted, before, strict=True))
+    else:
+        assert wanted in ([w.t_end_ns for w in before], [w.t_end_ns for w in before[:-1]])
+
+
+def test_an_evenly_timed_image_is_of_the_middle_of_its_window() -> None:
+    events = event_file(np.arange(0, 1_000_000, 1000))
+    windows = list(periodic(events, 100_000).showing(0.5).windows(events))
+    assert [window.t_shown_ns for window in windows] == [100_000 * number for number in range(1, 10)]
+    assert [window.t_end_ns for window in windows] == [100_000 * number + 50_000 for number in range(1, 10)]
+
+
+def test_images_at_given_times_are_not_lost_at_the_end_of_the_recording() -> None:
+    events = event_file(np.arange(0, 1_000_000, 1000))
+    times = np.array([200_000, 400_000, 999_000])
+    plan = at_times(events, times, "the test").showing(0.5)
+    assert [window.t_shown_ns for window in plan.windows(events) if window.wanted] == times.tolist()
 
 
 @settings(deadline=None, max_examples=30)
