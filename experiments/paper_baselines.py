@@ -10,9 +10,7 @@ from jaxcal.recording.windows import Window
 _LEAK_S = 0.1  # time in which the integrator forgets
 
 
-def leaky_integration(
-    windows: Iterable[Window], width: int, height: int
-) -> Iterator[tuple[int, np.ndarray]]:
+def leaky_integration(windows: Iterable[Window], width: int, height: int) -> Iterator[tuple[int, np.ndarray]]:
     """Events summed up with their sign, older ones less: exp(-age / 100 ms), as of the window's end."""
     level, before = np.zeros(width * height), None
     for end_ns, events, *_ in windows:

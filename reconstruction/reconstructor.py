@@ -18,7 +18,7 @@ from reconstruction import voxel_torch
 from reconstruction.colour import bayer_places, merged
 from reconstruction.networks import ReconstructionNetwork
 from reconstruction.networks.base import State
-from reconstruction.voxel import RunningScale, accumulate, normalise, window_time
+from reconstruction.voxel import WindowAndScale, accumulate, scaler, window_time
 
 logger = logging.getLogger(__name__)
 
@@ -106,7 +106,7 @@ class Reconstructor:
         self._last_image: np.ndarray | None = None
         self._last_us: float | None = None
         self._tone_curve.reset()
-        self._scaled = RunningScale() if self.network.scaling == "running" else normalise
+        self._scaled = scaler(self.network.scaling)
 
     def __call__(
         self,
@@ -158,15 +158,20 @@ class Reconstructor:
     ) -> Float[torch.Tensor, "bins {self.height} {self.width}"]:
         size: dict[str, int] = {"width": self.width, "height": self.height, "num_bins": self.network.num_bins}
         raw = self.no_normalize or self.network.scaling == "none"
-        if self.device.type == "cuda" and self.network.scaling != "running":
-            return self._voxels_on_gpu(voxel_torch.accumulate(x, y, t_us, p, **size, device=self.device, span=span), raw)
+        if self.device.type == "cuda" and self.network.scaling in ("window", "none"):
+            return self._voxels_on_gpu(
+                voxel_torch.accumulate(x, y, t_us, p, **size, device=self.device, span=span), raw
+            )
         grid = accumulate(x, y, t_us, p, **size, span=span)
         if self._working_cells is not None:
             grid = grid * self._working_cells
         if self.flip:
             grid = grid[:, ::-1, ::-1]
-        grid = np.ascontiguousarray(grid) if raw else self._scaled(grid)
-        return torch.from_numpy(grid).to(self.device)
+        if not raw:
+            grid = self._scaled(grid)
+        elif isinstance(self._scaled, WindowAndScale):
+            grid = self._scaled.beside(grid, grid)
+        return torch.from_numpy(np.ascontiguousarray(grid)).to(self.device)
 
     def _voxels_on_gpu(self, grid: torch.Tensor, raw: bool) -> torch.Tensor:
         if self._working_cells is not None:

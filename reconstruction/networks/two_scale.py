@@ -41,7 +41,7 @@ class TwoScaleNet(ReconstructionNetwork):
             "scaling": scaling,
             "shown_at": self.shown_at,
         }
-        self.head = ConvLayer(4 * self.num_bins, detail, 3)
+        self.head = ConvLayer(4 * self.num_bins + (scaling == "window+scale"), detail, 3)
         self.body = FireBody(
             4 * detail, 4 * detail, channels=int(channels), num_residual_blocks=2, recurrent_residual=[]
         )
@@ -49,7 +49,8 @@ class TwoScaleNet(ReconstructionNetwork):
         self.pred = ConvLayer(detail, 4, 3, relu=False)
 
     def forward(self, voxels: torch.Tensor, state: State | None) -> tuple[torch.Tensor, State]:
-        head = self.head(F.pixel_unshuffle(voxels, 2))
+        bins, scale = voxels[:, : self.num_bins], voxels[:, self.num_bins :, ::2, ::2]
+        head = self.head(torch.cat([F.pixel_unshuffle(bins, 2), scale], dim=1))
         coarse, after = self.body(F.pixel_unshuffle(head, 2), state)
         joined = self.tail(torch.cat([head, F.pixel_shuffle(coarse, 2).to(head.dtype)], dim=1))
         with torch.autocast(joined.device.type, enabled=False):  # grey levels need more than bfloat16's eight bits

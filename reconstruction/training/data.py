@@ -12,14 +12,14 @@ from jaxtyping import Float
 from jaxcal.progress import Progress, no_progress, track
 from reconstruction.training.recipe import DataRecipe, Stage, fingerprint
 from reconstruction.training.sequences import training_scene, windows
-from reconstruction.voxel import RunningScale, accumulate, normalise, window_time
+from reconstruction.voxel import accumulate, scaler, window_time
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """`voxels` (sequences, windows, bins, size, size) float16 and `targets` (sequences, windows, size, size) float16,
+    """`voxels` (sequences, windows, planes, size, size) float16 and `targets` (sequences, windows, size, size) float16,
     both mapped from disk."""
 
     voxels: np.ndarray
@@ -68,7 +68,7 @@ def load_or_generate(recipe: DataRecipe, num_bins: int, cache: Path, progress: P
 def _generate(recipe: DataRecipe, num_bins: int, index: int, path: Path) -> None:
     rng = np.random.default_rng([recipe.seed, index])
     scene = training_scene(rng, recipe)
-    scaled = RunningScale() if recipe.scaling == "running" else normalise
+    scaled = scaler(recipe.scaling)
     voxels, targets = [], []
     for window in windows(scene, seed=index):
         size = {"width": recipe.size, "height": recipe.size, "num_bins": num_bins}

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 
 from jaxcal.progress import Progress, no_progress
@@ -84,13 +85,22 @@ def _start(recipe: Recipe, parent: ReconstructionNetwork | None = None) -> Run:
         shown_at=recipe.data.shown_at,
     )
     if parent is not None:
-        network.load_state_dict(parent.state_dict())
+        network.load_state_dict(_widened(parent.state_dict(), network.state_dict()))
     if recipe.precision == "bfloat16":
         network = network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay, betas=(0.9, 0.99)
     )
     return Run(network, copy.deepcopy(network), optimiser)
+
+
+def _widened(weights: dict[str, torch.Tensor], fresh: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """A parent's weights; where a convolution reads more channels than the parent's did, it starts by ignoring them."""
+    widened = {}
+    for name, values in weights.items():
+        missing = fresh[name].shape[1] - values.shape[1] if values.ndim == 4 else 0
+        widened[name] = F.pad(values, (0, 0, 0, 0, 0, missing)) if missing else values
+    return widened
 
 
 def _train_on_clip(run: Run, recipe: Recipe, stage: Stage, dataset: Dataset) -> None:

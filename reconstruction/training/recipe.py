@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -96,26 +96,37 @@ def fingerprint(recipe: DataRecipe | Recipe) -> str:
 
 
 PATTERNS_V1 = Recipe()
-# Images of the window's middle, with events on either side of it: nothing lags. Work at a quarter of the resolution.
-PATTERNS_V2 = Recipe(
-    data=DataRecipe(
-        sequences=600,
-        checkerboards=0.45,
-        others=0.1,
-        smallest_bit_px=1.8,
-        longest_window_ms=100.0,
-        edge_on=False,
-        shown_at=0.5,
-        seed=2028,
-    ),
+_DATA_V2 = DataRecipe(
+    sequences=600,
+    checkerboards=0.45,
+    others=0.1,
+    smallest_bit_px=1.8,
+    longest_window_ms=100.0,
+    edge_on=False,
+    shown_at=0.5,
+    seed=2028,
+)
+# Images of the window's middle, with events on either side of it. Work at a quarter of the resolution.
+_PARENT_V2 = Recipe(
+    data=_DATA_V2,
     stages=(
         Stage(crop=64, windows=10, segments=1, batch=4, clips=2000),
-        Stage(crop=96, windows=12, segments=4, batch=4, clips=1000),
+        Stage(crop=96, windows=12, segments=4, batch=4, clips=2000),
     ),
     architecture="TwoScaleNet",
-    channels=32,
     num_bins=8,
     falling_share=0.6,
     seed=2,
+)
+# Then with the scale of the counts, and with corners in the loss.
+PATTERNS_V2 = replace(
+    _PARENT_V2,
+    data=replace(_DATA_V2, scaling="window+scale"),
+    stages=(Stage(crop=96, windows=12, segments=4, batch=4, clips=1200),),
+    learning_rate=1e-3,
+    falling_share=0.8,
+    displacement_weight=0.15,
+    parent=_PARENT_V2,
+    seed=3,
 )
 RECIPES = {"patterns_v1": PATTERNS_V1, "patterns_v2": PATTERNS_V2}

@@ -29,7 +29,8 @@ BUILDERS: list[tuple[type[ReconstructionNetwork], dict[str, Any]]] = [
     *((E2VIDRecurrent, SMALL | switches) for switches in E2VID_SWITCHES),
     *((FireNet, {"base_num_channels": 8} | switches) for switches in FIRENET_SWITCHES),
     *((FoldedFireNet, {"channels": 4, "fold": fold}) for fold in (1, 2, 4)),
-    *((TwoScaleNet, {"channels": 8, "detail": 4, "num_bins": bins}) for bins in (5, 8)),
+    *((TwoScaleNet, {"channels": 8, "detail": 4, "num_bins": bins, "scaling": "window"}) for bins in (5, 8)),
+    (TwoScaleNet, {"channels": 8, "detail": 4, "scaling": "window+scale"}),
 ]
 
 
@@ -40,9 +41,13 @@ def network(request: pytest.FixtureRequest) -> ReconstructionNetwork:
     return architecture(**settings).eval().requires_grad_(False)
 
 
+def planes(network: ReconstructionNetwork) -> int:
+    return network.num_bins + (network.scaling == "window+scale")
+
+
 def test_image_has_the_inputs_size_and_the_state_changes_the_next_image(network: ReconstructionNetwork):
     torch.manual_seed(1)
-    voxels = torch.randn(2, network.num_bins, 2 * network.multiple + 16, 3 * network.multiple + 16)
+    voxels = torch.randn(2, planes(network), 2 * network.multiple + 16, 3 * network.multiple + 16)
     first, state = network(voxels, None)
     again, _ = network(voxels, None)
     second, _ = network(voxels, state)
@@ -56,7 +61,7 @@ def test_settings_rebuild_the_same_network(network: ReconstructionNetwork):
     twin = type(network)(**network.settings)
     twin.load_state_dict(network.state_dict())
     twin.eval()
-    voxels = torch.randn(1, network.num_bins, 32, 32)
+    voxels = torch.randn(1, planes(network), 32, 32)
     assert torch.equal(network(voxels, None)[0], twin(voxels, None)[0])
 
 

@@ -275,7 +275,9 @@ def test_stream_shows_the_moment_that_is_asked_for_wherever_it_is_in_the_window(
 
 
 def test_stream_tells_by_itself_when_its_images_are_of():
-    events = [Events(np.array([t]), *(np.zeros(1, np.uint16),) * 2, np.ones(1, bool), 4, 4) for t in (100, 1_000, 2_500)]
+    events = [
+        Events(np.array([t]), *(np.zeros(1, np.uint16),) * 2, np.ones(1, bool), 4, 4) for t in (100, 1_000, 2_500)
+    ]
     windows = list(zip((1_000, 2_000, 3_000), events[:1] + events[1:], strict=True))
     for shown_at, expected in ((0.5, [550, 1_500, 2_500]), (1.0, [1_000, 2_000, 3_000])):
         stream = reconstruction.reconstruct(windows, _Clock(shown_at), width=4, height=4)

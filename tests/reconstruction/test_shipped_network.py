@@ -26,7 +26,7 @@ def _one_thread():
 
 def test_default_is_found_by_name_and_path():
     default = reconstruction.load_network()
-    voxels = torch.randn(1, default.num_bins, 16, 16)
+    voxels = torch.randn(1, default.num_bins + (default.scaling == "window+scale"), 16, 16)
     for place in (DEFAULT_NETWORK, WEIGHTS, str(WEIGHTS)):
         assert torch.equal(reconstruction.load_network(place)(voxels, None)[0], default(voxels, None)[0])
     assert not default.training
@@ -59,9 +59,7 @@ def test_card_states_what_a_fresh_measurement_gives():
 def test_board_is_found_in_what_it_reconstructs(precision: str):
     network = reconstruction.load_network()
     scene = evaluation_scene(np.random.default_rng(4), 6, top_speed=8.0, shown_at=network.shown_at)
-    reconstructor = reconstruction.Reconstructor(
-        network, scene.view.width, scene.view.height, precision=precision
-    )
+    reconstructor = reconstruction.Reconstructor(network, scene.view.width, scene.view.height, precision=precision)
     for window in windows(scene, seed=4):
         image = reconstructor(window.x, window.y, window.t_us, window.p, window.span_us)
     corners = find_corners(image, (9, 6))

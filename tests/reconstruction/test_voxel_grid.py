@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from jaxcal.errors import CalibrationError
 from reconstruction import voxel_grid, voxel_torch
-from reconstruction.voxel import RunningScale, accumulate, normalise, window_time
+from reconstruction.voxel import RunningScale, WindowAndScale, accumulate, normalise, scaler, window_time
 
 WIDTH, HEIGHT = 7, 5
 SIZE = {"width": WIDTH, "height": HEIGHT}
@@ -216,3 +216,25 @@ def test_a_given_span_places_the_bins(seed: int):
     np.testing.assert_array_equal(own, accumulate(x, y, t, p, **size))
     on_torch = voxel_torch.accumulate(x, y, t, p, **size, device="cpu", span=(0.0, 1.0))
     np.testing.assert_allclose(on_torch.numpy(), grid, atol=1e-5)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(2, 12), st.integers(0, 2**32 - 1))
+def test_the_scale_beside_a_grid_tells_the_events_of_an_edge(count: int, seed: int):
+    """However few the windows' events are compared with each other: normalised grids are equal, scales are not."""
+    shape = np.random.default_rng(seed).choice([-1.0, 0.0, 1.0], (5, 6, 7)).astype(np.float32)
+    shape[1:] = 0.0
+    shape[0, 0, :2] = [1.0, -1.0]
+    together = WindowAndScale()
+    made = together(count * shape)
+    assert made.shape == (6, 6, 7)
+    np.testing.assert_allclose(made[:5], normalise(shape), atol=1e-5)
+    assert np.all(made[5] == np.float32(0.5 * np.log(count)))
+    np.testing.assert_array_equal(together.beside(shape, shape)[:5], shape)  # of a slower window: hardly less
+    assert together(shape)[5, 0, 0] == pytest.approx(0.5 * np.log(0.99**2 * count), abs=1e-6)
+
+
+def test_each_recording_has_a_scale_of_its_own():
+    assert scaler("window") is scaler("none") is normalise
+    assert scaler("window+scale") is not scaler("window+scale")
+    assert isinstance(scaler("running"), RunningScale)
