@@ -63,8 +63,8 @@ class WindowPlan(Protocol):
 @dataclass(frozen=True)
 class TimedWindows:
     """Windows that end at known times: `ends_ns` (W,) int64, increasing; `wanted` (W,) bool; the first one begins at
-    `start_ns` (None: at the first event). `shown_ns` (W,) the moments that the images show (None: the ends). No window is
-    to end behind `last_ns` (None: the last ones may reach beyond the recording)."""
+    `start_ns` (None: at the first event). `shown_ns` (W,) the moments that the images show (None: the ends). No window
+    is to end behind `last_ns` (None: the last ones may reach beyond the recording)."""
 
     ends_ns: np.ndarray
     wanted: np.ndarray
