@@ -48,10 +48,12 @@ class KnownProblem:
 
     @property
     def layout(self) -> SharedLayout:
+        """Where each camera's parameters stand among the shared coordinates."""
         return self.problem.layout
 
     @property
     def num_views(self) -> int:
+        """How many poses of the rig there are."""
         return len(self.times_s)
 
     @property

@@ -50,6 +50,7 @@ class RobustFit:
 
     @property
     def state(self) -> RigState:
+        """The optimum."""
         return self.result.state
 
 

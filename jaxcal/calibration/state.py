@@ -25,6 +25,7 @@ class ImuPlace:
 
     @property
     def size(self) -> int:
+        """How many shared coordinates are its own."""
         return self.parameters + 7 * self.placed
 
 
@@ -51,32 +52,40 @@ class SharedLayout:
 
     @property
     def num_cameras(self) -> int:
+        """How many cameras there are."""
         return len(self.sizes)
 
     @property
     def size(self) -> int:
+        """How many shared coordinates there are."""
         inertial = sum(imu.size for imu in self.imus) + self.gravity_size
         return sum(self.sizes) + 7 * self.num_cameras + inertial + sum(self.rolling) + self.target_size
 
     @property
     def target_size(self) -> int:
+        """How many of them are the target's."""
         return 6 * self.extra_boards + 2 * self.warp + 3 * self.offsets
 
     def start(self, camera: int) -> int:
+        """Where the coordinates of a camera begin."""
         return sum(self.sizes[:camera]) + 7 * camera
 
     def lens(self, camera: int) -> slice:
+        """A camera's lens parameters."""
         return slice(self.start(camera), self.start(camera) + self.sizes[camera])
 
     def rotation(self, camera: int) -> slice:
+        """The rotation of T_cam_rig of a camera (3)."""
         first = self.lens(camera).stop
         return slice(first, first + 3)
 
     def pose(self, camera: int) -> slice:
+        """T_cam_rig of a camera: rotation, translation (6)."""
         first = self.lens(camera).stop
         return slice(first, first + 6)
 
     def shift(self, camera: int) -> int:
+        """Where the time shift of a camera stands."""
         return self.lens(camera).stop + 6
 
     def imu(self, number: int) -> slice:
@@ -91,6 +100,7 @@ class SharedLayout:
 
     @property
     def gravity(self) -> slice:
+        """The direction of gravity (2), or all of it (3)."""
         stop = self.size - self.target_size - sum(self.rolling)
         return slice(stop - self.gravity_size, stop)
 
@@ -108,6 +118,7 @@ class SharedLayout:
 
     @property
     def target(self) -> slice:
+        """The target: boards' places, warp, offsets of points."""
         return slice(self.size - self.target_size, self.size)
 
     def place(self, camera: int) -> tuple[int, int]:

@@ -113,6 +113,7 @@ class CountedWindows:
 
     @property
     def _part(self) -> int:
+        """Events of a part."""
         return -(-self.number // self.parts)
 
     def count(self, events: EventFile) -> int:
