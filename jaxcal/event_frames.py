@@ -82,7 +82,7 @@ def frames_key(events: EventFile, plan: WindowPlan, network: Any, options: Mappi
     """A hash of all that the frames depend on: the event file, the windows, the network's weights and the options."""
     digest = hashlib.sha256()
     facts = [_FRAMES_VERSION, *events.fingerprint(), events.width, events.height]
-    digest.update(json.dumps([*facts, type(network).__name__, dict(options)], default=str).encode())
+    digest.update(json.dumps([*facts, type(network).__name__, network.shown_at, dict(options)], default=str).encode())
     hot_pixels = options.get("hot_pixels")
     if isinstance(hot_pixels, str | Path) and hot_pixels != AUTOMATIC and Path(hot_pixels).is_file():
         digest.update(Path(hot_pixels).read_bytes())

@@ -18,7 +18,7 @@ from reconstruction import voxel_torch
 from reconstruction.colour import bayer_places, merged
 from reconstruction.networks import ReconstructionNetwork
 from reconstruction.networks.base import State
-from reconstruction.voxel import WindowAndScale, accumulate, scaler, window_time
+from reconstruction.voxel import RunningAndScale, accumulate, scaler, window_time
 
 logger = logging.getLogger(__name__)
 
@@ -169,8 +169,9 @@ class Reconstructor:
             grid = grid[:, ::-1, ::-1]
         if not raw:
             grid = self._scaled(grid)
-        elif isinstance(self._scaled, WindowAndScale):
-            grid = self._scaled.beside(grid, grid)
+        elif isinstance(self._scaled, RunningAndScale):
+            self._scaled(grid)  # for the plane beside it
+            grid = self._scaled.beside(grid)
         return torch.from_numpy(np.ascontiguousarray(grid)).to(self.device)
 
     def _voxels_on_gpu(self, grid: torch.Tensor, raw: bool) -> torch.Tensor:

@@ -102,42 +102,35 @@ class RunningScale:
         self.events = 1.0
 
     def __call__(self, grid: Float[np.ndarray, "bins height width"]) -> Float[np.ndarray, "bins height width"]:
-        self.update(grid)
-        return (grid * np.float32(_GAIN / self.events)).astype(np.float32)
-
-    def update(self, grid: Float[np.ndarray, "bins height width"]) -> None:
-        """Take account of the next window."""
         net = np.rint(np.abs(grid.sum(axis=0))).astype(np.int64).ravel()
         weight = np.cumsum(np.bincount(net) * np.arange(net.max(initial=0) + 1))
         median = float(np.searchsorted(weight, 0.5 * weight[-1])) if weight[-1] else 0.0
         self.events = max(median, _FADING * self.events, 1.0)
+        return (grid * np.float32(_GAIN / self.events)).astype(np.float32)
 
 
-class WindowAndScale:
-    """Normalised voxel grids with one more plane: half the logarithm of what `RunningScale` takes as its unit.
+class RunningAndScale:
+    """Voxel grids as of `RunningScale`, and one more plane: half the logarithm of its unit.
 
-    A normalised grid does not tell how many events an edge makes, and so not the contrast threshold; but edges that
-    move appear behind their places by an amount that grows with it.
+    A scaled grid does not tell how many events an edge makes, and so not the contrast threshold; but edges that move
+    appear behind their places by an amount that grows with it.
     """
 
     def __init__(self) -> None:
         self._scale = RunningScale()
 
     def __call__(self, grid: Float[np.ndarray, "bins height width"]) -> Float[np.ndarray, "planes height width"]:
-        return self.beside(normalise(grid), grid)
+        return self.beside(self._scale(grid))
 
-    def beside(
-        self, scaled: Float[np.ndarray, "bins height width"], grid: Float[np.ndarray, "bins height width"]
-    ) -> Float[np.ndarray, "planes height width"]:
-        """`scaled` with the plane that `grid`, the next window's, gives."""
-        self._scale.update(grid)
+    def beside(self, grid: Float[np.ndarray, "bins height width"]) -> Float[np.ndarray, "planes height width"]:
+        """A grid and the plane as of the last call."""
         plane = np.full((1, *grid.shape[1:]), 0.5 * np.log(self._scale.events), dtype=np.float32)
-        return np.concatenate([scaled, plane])
+        return np.concatenate([grid, plane])
 
 
 def scaler(scaling: str) -> Callable[[np.ndarray], np.ndarray]:
     """What scales the voxel grids of one recording, called window after window; `scaling` of a network."""
-    return {"running": RunningScale, "window+scale": WindowAndScale}.get(scaling, lambda: normalise)()
+    return {"running": RunningScale, "running+scale": RunningAndScale}.get(scaling, lambda: normalise)()
 
 
 def check_events(

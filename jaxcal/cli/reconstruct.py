@@ -101,8 +101,9 @@ def reconstruct(source: str | None, named_source: str | None, **options: Any) ->
     jaxcal reconstruct recording.raw --imu imu0/data.csv --output frames/
     jaxcal calibrate-cameras frames/ --target board.yaml --out result
 
-    EVENTS is any event recording that `jaxcal info` knows. Frames carry the end of their window [t0, t1): every event
-    up to the last frame is in exactly one window. At given times, a window that is much longer than usual is divided.
+    EVENTS is any event recording that `jaxcal info` knows. A frame carries the moment that it shows: the middle of its
+    window [t0, t1) with the network that jaxcal ships, the end with E2VID's. Every event up to the last window's end is
+    in exactly one window. At given times, a window that is much longer than usual is divided.
 
     The folder appears when it is complete; a run that was killed starts anew, one that had finished is not repeated.
 

@@ -1,4 +1,4 @@
-"""FoldedFireNet, the default network: FireNet's layout on an input folded by space-to-depth, so that it is quick."""
+"""FoldedFireNet, of patterns_v1: FireNet's layout on an input folded by space-to-depth, so that it is quick."""
 
 from typing import Any
 

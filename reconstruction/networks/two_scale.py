@@ -41,7 +41,7 @@ class TwoScaleNet(ReconstructionNetwork):
             "scaling": scaling,
             "shown_at": self.shown_at,
         }
-        self.head = ConvLayer(4 * self.num_bins + (scaling == "window+scale"), detail, 3)
+        self.head = ConvLayer(4 * self.num_bins + (scaling == "running+scale"), detail, 3)
         self.body = FireBody(
             4 * detail, 4 * detail, channels=int(channels), num_residual_blocks=2, recurrent_residual=[]
         )

@@ -116,7 +116,7 @@ def _moment(network: ReconstructionNetwork) -> str:
 def _input(recipe: Recipe) -> str:
     grid = {
         "window": "normalised voxel grid (E2VID)",
-        "window+scale": "normalised voxel grid (E2VID) and the scale of its counts (`WindowAndScale`)",
+        "running+scale": "voxel grid in units of a passing edge's events, and how many these are (`RunningAndScale`)",
         "running": "voxel grid in units of a passing edge's events (`RunningScale`)",
     }[recipe.data.scaling]
     return f"{grid} of a window of 10 to {recipe.data.longest_window_ms:g} ms, {recipe.num_bins} time bins"

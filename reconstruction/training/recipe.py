@@ -121,7 +121,7 @@ _PARENT_V2 = Recipe(
 # Then with the scale of the counts, and with corners in the loss.
 PATTERNS_V2 = replace(
     _PARENT_V2,
-    data=replace(_DATA_V2, scaling="window+scale"),
+    data=replace(_DATA_V2, scaling="running+scale"),
     stages=(Stage(crop=96, windows=12, segments=4, batch=4, clips=1200),),
     learning_rate=1e-3,
     falling_share=0.8,

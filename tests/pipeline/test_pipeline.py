@@ -121,7 +121,9 @@ def test_mistakes_in_the_rig_are_reported_before_any_work(tmp_path: Path) -> Non
 
 
 class CountingNetwork:
-    """Paints each window's number of events; has weights, as the real ones."""
+    """Paints each window's number of events; has weights, as the real ones, and shows the end of the window."""
+
+    shown_at = 1.0
 
     def __init__(self, weight: float) -> None:
         self.weight = weight
@@ -138,7 +140,7 @@ def network(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     fake = SimpleNamespace(weight=1.0, windows=[])
 
     def reconstruct(
-        windows: Iterable[tuple[int, Events, bool]],
+        windows: Iterable[tuple[int, Events, bool, int]],
         network: CountingNetwork,
         *,
         width: int,
@@ -146,10 +148,10 @@ def network(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         **options: Any,
     ) -> Iterator[tuple[int, np.ndarray]]:
         fake.options = options
-        for end, events, wanted in windows:
+        for end, events, wanted, shown in windows:
             fake.windows.append((end, len(events)))
             if wanted:
-                yield end, np.full((height, width), len(events) % 256, np.uint8)
+                yield shown, np.full((height, width), len(events) % 256, np.uint8)
 
     fake.load_network = lambda path=None: CountingNetwork(fake.weight)
     fake.reconstruct = reconstruct

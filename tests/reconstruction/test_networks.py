@@ -30,7 +30,7 @@ BUILDERS: list[tuple[type[ReconstructionNetwork], dict[str, Any]]] = [
     *((FireNet, {"base_num_channels": 8} | switches) for switches in FIRENET_SWITCHES),
     *((FoldedFireNet, {"channels": 4, "fold": fold}) for fold in (1, 2, 4)),
     *((TwoScaleNet, {"channels": 8, "detail": 4, "num_bins": bins, "scaling": "window"}) for bins in (5, 8)),
-    (TwoScaleNet, {"channels": 8, "detail": 4, "scaling": "window+scale"}),
+    (TwoScaleNet, {"channels": 8, "detail": 4, "scaling": "running+scale"}),
 ]
 
 
@@ -42,7 +42,7 @@ def network(request: pytest.FixtureRequest) -> ReconstructionNetwork:
 
 
 def planes(network: ReconstructionNetwork) -> int:
-    return network.num_bins + (network.scaling == "window+scale")
+    return network.num_bins + (network.scaling == "running+scale")
 
 
 def test_image_has_the_inputs_size_and_the_state_changes_the_next_image(network: ReconstructionNetwork):

@@ -103,7 +103,7 @@ def test_training_reduces_the_loss_on_what_it_sees(tiny_dataset: Dataset, tmp_pa
 
 def test_a_child_that_reads_more_starts_where_its_parent_ended(tiny_dataset: Dataset, tmp_path: Path):
     parent = replace(TINY, architecture="TwoScaleNet", channels=8)
-    child = replace(parent, data=replace(TINY.data, scaling="window+scale"), seed=4)
+    child = replace(parent, data=replace(TINY.data, scaling="running+scale"), seed=4)
     network = loop.train(parent, tiny_dataset, tmp_path / "run.pt").average
     voxels = torch.randn(1, 5, 16, 16)
     scale = torch.full((1, 1, 16, 16), 0.7)
@@ -112,7 +112,7 @@ def test_a_child_that_reads_more_starts_where_its_parent_ended(tiny_dataset: Dat
         torch.testing.assert_close(grown(torch.cat([voxels, scale], dim=1), None)[0], network(voxels, None)[0])
     dataset = load_or_generate(child.data, child.num_bins, tmp_path)
     assert dataset.voxels.shape == (3, 8, 6, 32, 32)
-    np.testing.assert_array_equal(dataset.voxels[:, :, :5], tiny_dataset.voxels)
+    assert np.all(dataset.voxels[:, :, 5] == dataset.voxels[:, :, 5, :1, :1])
     trained = loop.train(child, dataset, tmp_path / "child.pt", parent=network).average.state_dict()
     assert trained["head.conv2d.weight"][:, -1].abs().max() > 0
 
