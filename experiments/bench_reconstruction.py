@@ -15,6 +15,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,7 +55,7 @@ def voxels_against_network(network: ReconstructionNetwork, repeat: int) -> float
     ratios = []
     for count in EVENTS:
         x, y, t, p = moving_edges(count, seed=count)
-        size = {"width": WIDTH, "height": HEIGHT, "num_bins": network.num_bins}
+        size: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "num_bins": network.num_bins}
         reconstructor = reconstruction.Reconstructor(network, WIDTH, HEIGHT)
         reconstructor(x, y, t, p)  # compiles, and allocates the state
         whole, _ = measured(lambda r=reconstructor, x=x, y=y, t=t, p=p: r(x, y, t, p), repeat)

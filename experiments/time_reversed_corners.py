@@ -5,8 +5,9 @@
 Corners in reconstructed images trail the events by a fraction of a millisecond: the network knows only what was. Run
 over the recording from its end, with time turned round and polarity flipped, it knows only what will be, and should
 lead by as much. Simulated checkerboards are reconstructed both ways up to the same moments, and corners are compared
-with the truth: forwards, backwards, and the mean of the two. Nothing of jaxcal uses this: the network that is shipped
-now shows the middle of its windows. patterns_v1, which shows the end, was not trained on streams that run backwards.
+with the truth: forwards, backwards, and the mean of the two. Nothing of jaxcal uses this: networks that show
+the middle of their windows see what comes, too. patterns_v1, which shows the end, was not trained on streams that run
+backwards.
 
 What it showed (4 scenes of 16 windows, 28 boards, patterns_v1): corners trail by 0.23 ms forwards and by 0.65 ms
 backwards, both behind the true motion; their mean by 0.44 ms. It does not cancel. This suggests that the lag is in the

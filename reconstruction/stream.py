@@ -58,7 +58,8 @@ def reconstruct(
                 f"{'lies outside' if network.shown_at < 1.0 else 'this network cannot: it shows the end'}."
             )
         previous_end = end
-        span_us = tuple((time - (origin_ns or 0)) * 1e-3 for time in (start, shown, end))
+        origin = origin_ns or 0
+        span_us = (1e-3 * (start - origin), 1e-3 * (shown - origin), 1e-3 * (end - origin))
         image = reconstructor(events.x, events.y, t_us, events.p, span_us)
         if not more or more[0]:
             yield shown, image

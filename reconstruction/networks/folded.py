@@ -1,4 +1,4 @@
-"""FoldedFireNet, of patterns_v1: FireNet's layout on an input folded by space-to-depth, so that it is quick."""
+"""FoldedFireNet, the default network: FireNet's layout on an input folded by space-to-depth, so that it is quick."""
 
 from typing import Any
 
@@ -18,13 +18,26 @@ class FoldedFireNet(ReconstructionNetwork):
     reduced_precision = True
 
     def __init__(
-        self, *, num_bins: int = 5, channels: int = 32, fold: int = 2, scaling: str = "window", **_ignored: Any
+        self,
+        *,
+        num_bins: int = 5,
+        channels: int = 32,
+        fold: int = 2,
+        scaling: str = "window",
+        shown_at: float = 1.0,
+        **_ignored: Any,
     ):
         super().__init__()
         self.num_bins = int(num_bins)
         self.multiple = int(fold)
-        self.scaling = scaling
-        self.settings = {"num_bins": self.num_bins, "channels": int(channels), "fold": int(fold), "scaling": scaling}
+        self.scaling, self.shown_at = scaling, float(shown_at)
+        self.settings = {
+            "num_bins": self.num_bins,
+            "channels": int(channels),
+            "fold": int(fold),
+            "scaling": scaling,
+            "shown_at": self.shown_at,
+        }
         self.body = FireBody(
             self.num_bins * self.multiple**2,
             self.multiple**2,

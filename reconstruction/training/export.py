@@ -75,8 +75,8 @@ No recordings, no third-party images.
 
 ## Recipe
 
-`python -m reconstruction.training --output models/ --name {path.stem}`, {run.seconds / 60:.0f} minutes of training with
-one thread on a shared machine with two CPU cores{_after_parent(recipe)}.
+`python -m reconstruction.training --output models/ --name {path.stem}`, {run.seconds / 60:.0f} minutes of training on
+two CPU cores{_after_parent(recipe)}.
 Loss: {_loss(recipe)}.
 AdamW {recipe.learning_rate:g}, falling to zero over the last {100 * recipe.falling_share:.0f} % of the steps, gradient
 norm clipped at {recipe.clip_norm}, weights averaged (decay {recipe.average_decay}); {recipe.precision}.

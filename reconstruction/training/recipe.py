@@ -106,8 +106,18 @@ _DATA_V2 = DataRecipe(
     shown_at=0.5,
     seed=2028,
 )
-# Images of the window's middle, with events on either side of it. Work at a quarter of the resolution.
-_PARENT_V2 = Recipe(
+# Images of the window's middle, with events on either side of it, and corners in the loss.
+PATTERNS_V2 = Recipe(
+    data=_DATA_V2,
+    stages=(Stage(crop=96, windows=12, segments=4, batch=4, clips=1000),),
+    learning_rate=1e-3,
+    falling_share=0.8,
+    displacement_weight=0.15,
+    parent=PATTERNS_V1,
+    seed=2,
+)
+# A quarter of the work.
+_PARENT_OF_QUICK = Recipe(
     data=_DATA_V2,
     stages=(
         Stage(crop=64, windows=10, segments=1, batch=4, clips=2000),
@@ -118,15 +128,14 @@ _PARENT_V2 = Recipe(
     falling_share=0.6,
     seed=2,
 )
-# Then with the scale of the counts, and with corners in the loss.
-PATTERNS_V2 = replace(
-    _PARENT_V2,
+PATTERNS_QUICK = replace(
+    _PARENT_OF_QUICK,
     data=replace(_DATA_V2, scaling="running+scale"),
     stages=(Stage(crop=96, windows=12, segments=4, batch=4, clips=1200),),
     learning_rate=1e-3,
     falling_share=0.8,
-    displacement_weight=0.15,
-    parent=_PARENT_V2,
+    displacement_weight=0.4,
+    parent=_PARENT_OF_QUICK,
     seed=3,
 )
-RECIPES = {"patterns_v1": PATTERNS_V1, "patterns_v2": PATTERNS_V2}
+RECIPES = {"patterns_v1": PATTERNS_V1, "patterns_v2": PATTERNS_V2, "patterns_quick": PATTERNS_QUICK}

@@ -1,8 +1,7 @@
-"""The network that is shipped: it is the file its card speaks of, and cv2 finds the board in what it reconstructs."""
+"""The networks that are shipped: each is the file its card speaks of, and cv2 finds the board in its images."""
 
 import hashlib
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +13,9 @@ from reconstruction.training.evaluate import evaluate, find_corners
 from reconstruction.training.sequences import evaluation_scene, windows
 
 WEIGHTS = MODELS_FOLDER / f"{DEFAULT_NETWORK}.safetensors"
+SHIPPED = sorted(file.stem for file in MODELS_FOLDER.glob("*.safetensors"))
+# In the last windows of this scene hardly anything moves, and the quick network remembers less than the others.
+LARGEST_RMS_PX = {"patterns_quick": 1.0}
 
 
 @pytest.fixture(autouse=True)
@@ -33,12 +35,14 @@ def test_default_is_found_by_name_and_path():
     assert default.multiple == 2
 
 
-def test_card_speaks_of_this_file():
-    card = Path(WEIGHTS).with_suffix(".md").read_text(encoding="utf-8")
-    assert hashlib.sha256(WEIGHTS.read_bytes()).hexdigest() in card
-    assert f"{WEIGHTS.stat().st_size} bytes" in card
-    assert read_metadata(WEIGHTS)["licence"] in card
-    parameters = sum(tensor.numel() for tensor in reconstruction.load_network().parameters())
+@pytest.mark.parametrize("name", SHIPPED)
+def test_card_speaks_of_this_file(name: str):
+    weights = MODELS_FOLDER / f"{name}.safetensors"
+    card = weights.with_suffix(".md").read_text(encoding="utf-8")
+    assert hashlib.sha256(weights.read_bytes()).hexdigest() in card
+    assert f"{weights.stat().st_size} bytes" in card
+    assert read_metadata(weights)["licence"] in card
+    parameters = sum(tensor.numel() for tensor in reconstruction.load_network(name).parameters())
     assert f"{parameters} parameters" in card
 
 
@@ -55,9 +59,10 @@ def test_card_states_what_a_fresh_measurement_gives():
     assert abs(fresh.reconstructed.latency_s) < 0.5e-3
 
 
+@pytest.mark.parametrize("name", SHIPPED)
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-def test_board_is_found_in_what_it_reconstructs(precision: str):
-    network = reconstruction.load_network()
+def test_board_is_found_in_what_it_reconstructs(precision: str, name: str):
+    network = reconstruction.load_network(name)
     scene = evaluation_scene(np.random.default_rng(4), 6, top_speed=8.0, shown_at=network.shown_at)
     reconstructor = reconstruction.Reconstructor(network, scene.view.width, scene.view.height, precision=precision)
     for window in windows(scene, seed=4):
@@ -65,7 +70,7 @@ def test_board_is_found_in_what_it_reconstructs(precision: str):
     corners = find_corners(image, (9, 6))
     assert corners is not None
     distance = np.linalg.norm(corners[:, None] - window.corners[None], axis=-1).min(axis=1)
-    assert np.sqrt((distance**2).mean()) < 0.5
+    assert np.sqrt((distance**2).mean()) < LARGEST_RMS_PX.get(name, 0.5)
     # Black and white are where the targets of the training had them.
     for truth, value in ((window.target < 0.1, 0.05), (window.target > 0.8, 0.9)):
         assert np.median(image[truth]) == pytest.approx(255 * value, abs=18)
