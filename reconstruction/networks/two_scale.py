@@ -13,10 +13,10 @@ from reconstruction.networks.firenet import FireBody
 class TwoScaleNet(ReconstructionNetwork):
     """A head on 2 x 2 blocks of pixels, FireNet's body on 4 x 4 blocks, and a tail that sees both.
 
-    What a pixel remembers needs no resolution of its own: the sixteen pixels of a block share `channels` numbers. The
-    body therefore costs a quarter of what it does on 2 x 2 blocks. Where edges lie to a fraction of a pixel is in the
-    events of this window; they reach the tail by `detail` channels of the head. The output is not squashed: about 0.05
-    for the pattern's black and 0.95 for its white.
+    The body costs a quarter of what it does on 2 x 2 blocks, and so does its memory: the sixteen pixels of a block
+    share `channels` numbers. Where edges lie to a fraction of a pixel is in the events of this window, which reach the
+    tail by `detail` channels of the head; where nothing moves for some windows, more is forgotten than by
+    FoldedFireNet. The output is not squashed: about 0.05 for the pattern's black and 0.95 for its white.
     """
 
     reduced_precision = True
