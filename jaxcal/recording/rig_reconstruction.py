@@ -76,15 +76,15 @@ _OPTIONS: dict[str, Callable[[Any, str], Any]] = {
     "precision": _one_of(*PRECISIONS),
     "device": as_text,
 }
-_PATHS = ("timestamps", "hot_pixels", "network")
+_PATHS = ("timestamps", "hot_pixels")
 _KEYS = ("window_ms", "network", "timestamps", "hot_pixels", *(key for key in _TIMES if key != "window_ms"), *_OPTIONS)
 
 
 @dataclass(frozen=True)
 class RigReconstruction:
     """How frames are made from events: `times` when they are wanted (nothing set: windows of the default length, or at
-    the stamps of a frame camera), `network` weights (None: the default), `options` of `reconstruction.Reconstructor`
-    that rig.yaml gives."""
+    the stamps of a frame camera), `network` weights, or the name of a network that is shipped (None: the default),
+    `options` of `reconstruction.Reconstructor` that rig.yaml gives."""
 
     times: FrameTimes = field(default_factory=FrameTimes)
     network: Path | None = None
@@ -123,4 +123,13 @@ def reconstruction_from_yaml(content: Any, folder: Path, where: str) -> RigRecon
     options = read(_OPTIONS)
     if "hot_pixels" in given:
         options["hot_pixels"] = "auto" if automatic else str(paths["hot_pixels"])
-    return RigReconstruction(times, paths.get("network"), options)
+    network = _network(given["network"], folder, f"{where}.network") if "network" in given else None
+    return RigReconstruction(times, network, options)
+
+
+def _network(value: Any, folder: Path, where: str) -> Path:
+    """A file of weights, or a bare name as it stands: whether there is such a network, `load_network` knows."""
+    name = Path(as_text(value, where))
+    if name.parent == Path() and not name.suffix and not (folder / name).exists():
+        return name
+    return existing_path(value, folder, where)
