@@ -87,7 +87,8 @@ class TimedWindows:
             return self
         shown = self.ends_ns
         steps = np.diff(shown)
-        usual = int(steps[-1]) if len(steps) else int(shown[0] - self.start_ns) if self.start_ns else _USUAL_NS
+        alone = _USUAL_NS if self.start_ns is None else int(shown[0]) - self.start_ns
+        usual = int(steps[-1]) if len(steps) else alone
         ends = shown + np.maximum(1, (1.0 - shown_at) * np.append(steps, usual)).astype(np.int64)
         kept = np.full(len(ends), True) if self.last_ns is None else ends <= self.last_ns
         count = np.flatnonzero(kept & self.wanted)[-1] + 1 if np.any(kept & self.wanted) else len(ends)
@@ -132,6 +133,7 @@ class CountedWindows:
             yield waiting._replace(wanted=True)
 
     def showing(self, shown_at: float) -> "CountedWindows":
+        """The same windows, whose images show another of their moments."""
         return replace(self, shown_at=shown_at)
 
     def key(self) -> bytes:

@@ -13,9 +13,9 @@ import reconstruction
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import Events
 from reconstruction.colour import bayer_places, merged
-from reconstruction.networks import E2VIDRecurrent, FireNet, FoldedFireNet, ReconstructionNetwork
+from reconstruction.networks import E2VIDRecurrent, FireNet, FoldedFireNet, ReconstructionNetwork, TwoScaleNet
 from reconstruction.reconstructor import unsharp_kernel
-from reconstruction.voxel import accumulate
+from reconstruction.voxel import RunningAndScale, accumulate
 
 Window = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 NOTHING: Window = tuple(np.zeros(0, dtype=np.int64) for _ in range(4))  # pyright: ignore[reportAssignmentType]
@@ -244,6 +244,20 @@ def test_stream_gives_the_reconstructors_images_at_the_windows_ends():
     for end, window, (t_ns, image) in zip(ends, windows, stream, strict=True):
         assert t_ns == end
         np.testing.assert_array_equal(image, reconstructor(*window))
+
+
+@pytest.mark.parametrize("no_normalize", [False, True])
+def test_a_network_gets_the_plane_that_it_asks_for_with_scaled_and_with_raw_counts(no_normalize: bool):
+    torch.manual_seed(5)
+    network = TwoScaleNet(channels=8, detail=4, scaling="running+scale").eval().requires_grad_(False)
+    seen: list[torch.Tensor] = []
+    network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    window = make_window(32, 24, 1)
+    reconstruction.Reconstructor(network, 32, 24, no_normalize=no_normalize)(*window)
+    grid = accumulate(*window, width=32, height=24, num_bins=8)
+    scaled = RunningAndScale()(grid)
+    np.testing.assert_allclose(seen[0][0, -1], scaled[-1])
+    np.testing.assert_allclose(seen[0][0, :8], grid if no_normalize else scaled[:8], atol=1e-4)
 
 
 class _Clock(ReconstructionNetwork):
