@@ -125,7 +125,9 @@ def calibrate_camera_imu(
         progress=progress,
         reweigh=noise.reweigh,
     )
-    covariance, chain, sentences = chain_covariance_and_sentences(fit, names, lenses, frames)
+    covariance, chain, sentences = chain_covariance_and_sentences(
+        fit, names, lenses, frames, noise.excesses(fit.problem, fit.state)
+    )
     results = imu_results.imu_calibrations(fit, imus, noise, chain, grid)
     settings = {
         "job": "calibrate_camera_imu",

@@ -20,21 +20,27 @@ from jaxcal.calibration.target_shape import target_points
 from jaxcal.calibration.view_noise import LEAN, share_of_place
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
-from jaxcal.estimation import BlockArrow, solve
+from jaxcal.estimation import BlockArrow, on_device, solve
 from jaxcal.results import Calibration, CameraCalibration, ImuCalibration, TargetShape
 from jaxcal.targets import Target
 
 
 def chain_covariance_and_sentences(
-    fit: RobustFit, names: Sequence[str], models: Sequence[CameraModel], cameras: Sequence[CameraFrames]
+    fit: RobustFit,
+    names: Sequence[str],
+    models: Sequence[CameraModel],
+    cameras: Sequence[CameraFrames],
+    imu_effects: Sequence[np.ndarray] = (),
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Covariance of shared parameters, marginal covariance of the chain, sentences on what is unobserved.
 
-    Corners that hang together tell less than least squares took from them: covariances allow for that.
+    Corners that hang together, and IMUs whose gyro and accel err with the motion by `imu_effects` (2,) each (factors of
+    their variance), tell less than least squares took from them: covariances allow for that.
     """
     labels = uncertainty.labels_of(names, models, fit.problem.layout)
     effects = _design_effects(fit, cameras)
-    equations = fit.result.equations if max(effects) == 1.0 else _equations_of_less(fit, cameras, effects)
+    as_weighted = max(effects) == 1.0 and all((effect == 1.0).all() for effect in imu_effects)
+    equations = fit.result.equations if as_weighted else _equations_of_less(fit, cameras, effects, imu_effects)
     covariance, chain, sentences = uncertainty.shared_covariance(
         equations, np.asarray(fit.problem.free), labels, to_parameters(fit.problem.basis, fit.problem.layout)
     )
@@ -66,11 +72,17 @@ def _design_effects(fit: RobustFit, cameras: Sequence[CameraFrames]) -> list[flo
     return [max(design_effect(model, points, *own), known.inflation) for model, *own, known in parts]
 
 
-def _equations_of_less(fit: RobustFit, cameras: Sequence[CameraFrames], effects: Sequence[float]) -> BlockArrow:
-    """The equations at the optimum with each camera's corners counting as much as they tell."""
+def _equations_of_less(
+    fit: RobustFit, cameras: Sequence[CameraFrames], effects: Sequence[float], imu_effects: Sequence[np.ndarray]
+) -> BlockArrow:
+    """The equations at the optimum with each camera's corners and each IMU's samples counting as much as they tell."""
     weights = [own / effect for own, effect in zip(_corner_weights(fit, cameras), effects, strict=True)]
     stacked = stack_weights(fit.problem.layout, cameras, weights)
     problem = eqx.tree_at(lambda p: [data.weight for data in p.corners], fit.problem, list(stacked))
+    if problem.imu is not None:
+        samples = zip(problem.imu.samples, imu_effects, strict=True)
+        inverse = [own.inverse_sigma / on_device(np.sqrt(np.repeat(effect, 3))) for own, effect in samples]
+        problem = eqx.tree_at(lambda p: [own.inverse_sigma for own in p.imu.samples], problem, inverse)
     return solve(problem, fit.state, max_steps=1).equations  # those that the first step would solve
 
 

@@ -30,7 +30,7 @@ _ENOUGH_FOR_NOISE = 1e-5
 _NEXT_DAMPING = 1e-7
 
 # Adapts a problem to the residuals found so far (re-weights its IMU, say) before a round.
-Reweigh = Callable[[RigProblem, RigState, int], RigProblem]
+Reweigh = Callable[[RigProblem, RigState], RigProblem]
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def _adapted(
     if result is None:
         return problem
     if reweigh is not None:
-        problem = reweigh(problem, result.state, stage)
+        problem = reweigh(problem, result.state)
     basis = told_apart(problem.basis, result.equations, np.asarray(problem.free), problem.layout)
     return eqx.tree_at(lambda p: p.basis, problem, basis, is_leaf=lambda leaf: leaf is None)
 

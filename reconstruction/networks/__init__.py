@@ -5,6 +5,7 @@ from reconstruction.networks.e2vid import E2VID, E2VIDRecurrent
 from reconstruction.networks.firenet import FireNet
 from reconstruction.networks.folded import FoldedFireNet
 from reconstruction.networks.two_scale import TwoScaleNet
+from reconstruction.networks.two_scale_memory import TwoScaleMemoryNet
 
 # Architecture name in a checkpoint -> class, built from the checkpoint's settings.
 ARCHITECTURES: dict[str, type[ReconstructionNetwork]] = {
@@ -12,6 +13,7 @@ ARCHITECTURES: dict[str, type[ReconstructionNetwork]] = {
     "E2VIDRecurrent": E2VIDRecurrent,
     "FireNet": FireNet,
     "FoldedFireNet": FoldedFireNet,
+    "TwoScaleMemoryNet": TwoScaleMemoryNet,
     "TwoScaleNet": TwoScaleNet,
 }
 
@@ -22,5 +24,6 @@ __all__ = [
     "FireNet",
     "FoldedFireNet",
     "ReconstructionNetwork",
+    "TwoScaleMemoryNet",
     "TwoScaleNet",
 ]

@@ -95,8 +95,9 @@ def _start(recipe: Recipe, parent: ReconstructionNetwork | None = None) -> Run:
 
 
 def _widened(weights: dict[str, torch.Tensor], fresh: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """A parent's weights; where a convolution reads more channels than the parent's did, it starts by ignoring them."""
-    widened = {}
+    """A parent's weights; where a convolution reads more channels than the parent's did, it starts by ignoring them;
+    what the parent has not starts afresh."""
+    widened = dict(fresh)
     for name, values in weights.items():
         missing = fresh[name].shape[1] - values.shape[1] if values.ndim == 4 else 0
         widened[name] = F.pad(values, (0, 0, 0, 0, 0, missing)) if missing else values

@@ -138,4 +138,26 @@ PATTERNS_QUICK = replace(
     parent=_PARENT_OF_QUICK,
     seed=3,
 )
-RECIPES = {"patterns_v1": PATTERNS_V1, "patterns_v2": PATTERNS_V2, "patterns_quick": PATTERNS_QUICK}
+# With a second memory, at first as it comes, then over longer spans of time.
+_PARENT_OF_V3 = replace(
+    PATTERNS_QUICK,
+    architecture="TwoScaleMemoryNet",
+    stages=(Stage(crop=96, windows=12, segments=4, batch=4, clips=1500),),
+    learning_rate=1.5e-3,
+    parent=PATTERNS_QUICK,
+    seed=4,
+)
+PATTERNS_V3 = replace(
+    _PARENT_OF_V3,
+    stages=(Stage(crop=96, windows=24, segments=2, batch=4, clips=1300),),
+    learning_rate=1e-3,
+    falling_share=0.9,
+    parent=_PARENT_OF_V3,
+    seed=5,
+)
+RECIPES = {
+    "patterns_v1": PATTERNS_V1,
+    "patterns_v2": PATTERNS_V2,
+    "patterns_quick": PATTERNS_QUICK,
+    "patterns_v3": PATTERNS_V3,
+}

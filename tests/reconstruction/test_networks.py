@@ -7,7 +7,14 @@ import pytest
 import torch
 
 from jaxcal.errors import CalibrationError
-from reconstruction.networks import E2VIDRecurrent, FireNet, FoldedFireNet, ReconstructionNetwork, TwoScaleNet
+from reconstruction.networks import (
+    E2VIDRecurrent,
+    FireNet,
+    FoldedFireNet,
+    ReconstructionNetwork,
+    TwoScaleMemoryNet,
+    TwoScaleNet,
+)
 from reconstruction.networks.blocks import ConvGRU
 
 SMALL = {"base_num_channels": 8, "num_encoders": 2, "num_residual_blocks": 1}
@@ -31,6 +38,7 @@ BUILDERS: list[tuple[type[ReconstructionNetwork], dict[str, Any]]] = [
     *((FoldedFireNet, {"channels": 4, "fold": fold}) for fold in (1, 2, 4)),
     *((TwoScaleNet, {"channels": 8, "detail": 4, "num_bins": bins, "scaling": "window"}) for bins in (5, 8)),
     (TwoScaleNet, {"channels": 8, "detail": 4, "scaling": "running+scale"}),
+    *((TwoScaleMemoryNet, {"channels": 8, "detail": 4, "scaling": how}) for how in ("window", "running+scale")),
 ]
 
 

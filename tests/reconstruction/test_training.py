@@ -79,7 +79,7 @@ def test_a_checkpoint_of_another_recipe_is_not_continued(tiny_dataset: Dataset, 
     assert all(torch.equal(restarted[name], fresh[name]) for name in fresh)
 
 
-@pytest.mark.parametrize("architecture", ["FoldedFireNet", "TwoScaleNet"])
+@pytest.mark.parametrize("architecture", ["FoldedFireNet", "TwoScaleNet", "TwoScaleMemoryNet"])
 def test_training_reduces_the_loss_on_what_it_sees(tiny_dataset: Dataset, tmp_path: Path, architecture: str):
     stage = Stage(crop=32, windows=8, segments=1, batch=2, clips=60)
     recipe = Recipe(
@@ -115,6 +115,19 @@ def test_a_child_that_reads_more_starts_where_its_parent_ended(tiny_dataset: Dat
     assert np.all(dataset.voxels[:, :, 5] == dataset.voxels[:, :, 5, :1, :1])
     trained = loop.train(child, dataset, tmp_path / "child.pt", parent=network).average.state_dict()
     assert trained["head.conv2d.weight"][:, -1].abs().max() > 0
+
+
+def test_a_child_with_a_memory_that_its_parent_lacks_has_the_parents_weights():
+    parent = replace(TINY, architecture="TwoScaleNet", channels=8)
+    given = loop._start(parent).network
+    network = loop._start(replace(parent, architecture="TwoScaleMemoryNet", seed=4), given).network
+    grown = network.state_dict()
+    for name, values in given.state_dict().items():
+        own = grown[name]
+        assert torch.equal(own[:, : values.shape[1]] if values.ndim == 4 else own, values)
+        assert values.ndim < 4 or not own[:, values.shape[1] :].any()
+    assert grown["gate.weight"].any()
+    assert (grown["gate.bias"] == 2.0).all()
 
 
 def test_data_are_generated_once_and_completed_after_an_interruption(tmp_path: Path, tiny_dataset: Dataset):
