@@ -17,9 +17,9 @@ from jaxcal.recording.windows import WindowPlan
 AUTOMATIC = "auto"
 
 # Corners in reconstructed frames trail behind the events, and no calibration can tell that lag from a time offset. With
-# the shipped network it was 0.2 to 0.7 ms in simulated recordings (models/patterns_v1.md,
+# the shipped network it was 0.1 to 0.4 ms in simulated recordings (models/patterns_v3.md,
 # experiments/paper_table1_detection.py, experiments/run_multicam.py); this is the 1-sigma that is allowed for it, s.
-LAG_SIGMA_S = 5e-4
+LAG_SIGMA_S = 3e-4
 
 # Raised whenever the same events could give other frames than before, apart from the network and the options.
 _FRAMES_VERSION = 1

@@ -101,9 +101,9 @@ def reconstruct(source: str | None, named_source: str | None, **options: Any) ->
     jaxcal reconstruct recording.raw --imu imu0/data.csv --output frames/
     jaxcal calibrate-cameras frames/ --target board.yaml --out result
 
-    EVENTS is any event recording that `jaxcal info` knows. A frame carries the moment that it shows: the end of its
-    window [t0, t1), or the middle (networks patterns_v2 and patterns_quick). Every event up to the last window's end is
-    in exactly one window. At given times, a window that is much longer than usual is divided.
+    EVENTS is any event recording that `jaxcal info` knows. A frame carries the moment that it shows: the middle of
+    its window [t0, t1), or the end (networks patterns_v1, E2VID, FireNet). Every event up to the last window's end is in
+    exactly one window. At given times, a window that is much longer than usual is divided.
 
     The folder appears when it is complete; a run that was killed starts anew, one that had finished is not repeated.
 

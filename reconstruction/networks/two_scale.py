@@ -1,4 +1,4 @@
-"""TwoScaleNet, of patterns_quick: state and most of the work at a quarter of the resolution, edges at half of it."""
+"""TwoScaleNet: state and most of the work at a quarter of the resolution, edges at half of it."""
 
 from typing import Any
 

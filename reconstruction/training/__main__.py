@@ -1,7 +1,7 @@
 """The command `python -m reconstruction.training`: simulate, train, evaluate, export weights and model card.
 
     python -m reconstruction.training --output models/                      # the shipped weights, from nothing
-    python -m reconstruction.training --output out/ --name patterns_v2 --parent models/patterns_v1.safetensors
+    python -m reconstruction.training --output out/ --name patterns_v1   # or another recipe's
 
 An interrupted run goes on where it stopped.
 """

@@ -96,7 +96,7 @@ def fingerprint(recipe: DataRecipe | Recipe) -> str:
 
 
 PATTERNS_V1 = Recipe()
-_DATA_V2 = DataRecipe(
+_MIDDLE = DataRecipe(
     sequences=600,
     checkerboards=0.45,
     others=0.1,
@@ -106,19 +106,9 @@ _DATA_V2 = DataRecipe(
     shown_at=0.5,
     seed=2028,
 )
-# Images of the window's middle, with events on either side of it, and corners in the loss.
-PATTERNS_V2 = Recipe(
-    data=_DATA_V2,
-    stages=(Stage(crop=96, windows=12, segments=4, batch=4, clips=1000),),
-    learning_rate=1e-3,
-    falling_share=0.8,
-    displacement_weight=0.15,
-    parent=PATTERNS_V1,
-    seed=2,
-)
-# A quarter of the work.
-_PARENT_OF_QUICK = Recipe(
-    data=_DATA_V2,
+# Most of the work at a quarter of the resolution; images of the window's middle, with events on either side of it.
+_TWO_SCALES = Recipe(
+    data=_MIDDLE,
     stages=(
         Stage(crop=64, windows=10, segments=1, batch=4, clips=2000),
         Stage(crop=96, windows=12, segments=4, batch=4, clips=2000),
@@ -128,36 +118,32 @@ _PARENT_OF_QUICK = Recipe(
     falling_share=0.6,
     seed=2,
 )
-PATTERNS_QUICK = replace(
-    _PARENT_OF_QUICK,
-    data=replace(_DATA_V2, scaling="running+scale"),
+# Corners in the loss, and the scale of the voxel grid beside it.
+_CORNERS = replace(
+    _TWO_SCALES,
+    data=replace(_MIDDLE, scaling="running+scale"),
     stages=(Stage(crop=96, windows=12, segments=4, batch=4, clips=1200),),
     learning_rate=1e-3,
     falling_share=0.8,
     displacement_weight=0.4,
-    parent=_PARENT_OF_QUICK,
+    parent=_TWO_SCALES,
     seed=3,
 )
 # With a second memory, at first as it comes, then over longer spans of time.
-_PARENT_OF_V3 = replace(
-    PATTERNS_QUICK,
+_MEMORY = replace(
+    _CORNERS,
     architecture="TwoScaleMemoryNet",
     stages=(Stage(crop=96, windows=12, segments=4, batch=4, clips=1500),),
     learning_rate=1.5e-3,
-    parent=PATTERNS_QUICK,
+    parent=_CORNERS,
     seed=4,
 )
 PATTERNS_V3 = replace(
-    _PARENT_OF_V3,
+    _MEMORY,
     stages=(Stage(crop=96, windows=24, segments=2, batch=4, clips=1300),),
     learning_rate=1e-3,
     falling_share=0.9,
-    parent=_PARENT_OF_V3,
+    parent=_MEMORY,
     seed=5,
 )
-RECIPES = {
-    "patterns_v1": PATTERNS_V1,
-    "patterns_v2": PATTERNS_V2,
-    "patterns_quick": PATTERNS_QUICK,
-    "patterns_v3": PATTERNS_V3,
-}
+RECIPES = {"patterns_v1": PATTERNS_V1, "patterns_v3": PATTERNS_V3}

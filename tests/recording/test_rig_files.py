@@ -232,10 +232,10 @@ def test_the_reconstruction_is_read_in_full(tmp_path: Path, content: dict[str, A
 
 
 def test_a_network_is_a_file_or_a_name(tmp_path: Path, content: dict[str, Any]) -> None:
-    content["reconstruction"]["network"] = "patterns_quick"
-    assert load_rig(write(tmp_path, content)).reconstruction.network == Path("patterns_quick")
-    (tmp_path / "patterns_quick").touch()
-    assert load_rig(write(tmp_path, content)).reconstruction.network == tmp_path / "patterns_quick"
+    content["reconstruction"]["network"] = "patterns_v1"
+    assert load_rig(write(tmp_path, content)).reconstruction.network == Path("patterns_v1")
+    (tmp_path / "patterns_v1").touch()
+    assert load_rig(write(tmp_path, content)).reconstruction.network == tmp_path / "patterns_v1"
 
 
 def test_the_reconstruction_must_fit_the_cameras(tmp_path: Path, content: dict[str, Any]) -> None:
