@@ -102,8 +102,8 @@ def reconstruct(source: str | None, named_source: str | None, **options: Any) ->
     jaxcal calibrate-cameras frames/ --target board.yaml --out result
 
     EVENTS is any event recording that `jaxcal info` knows. A frame carries the moment that it shows: the middle of
-    its window [t0, t1), or the end (networks patterns_v1, E2VID, FireNet). Every event up to the last window's end is in
-    exactly one window. At given times, a window that is much longer than usual is divided.
+    its window [t0, t1), or the end (networks patterns_v1, E2VID, FireNet). Every event up to the last window's end is
+    in exactly one window. At given times, a window that is much longer than usual is divided.
 
     The folder appears when it is complete; a run that was killed starts anew, one that had finished is not repeated.
 
