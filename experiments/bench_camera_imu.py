@@ -84,6 +84,7 @@ def write_recording(case: Case, duration_s: float, folder: Path) -> float:
 
 
 def read_recording(case: Case, folder: Path) -> tuple[list[Detections], ImuRecording]:
+    """The corners and the IMU that the simulation has written."""
     detections = [Detections.load(folder / f"cam{c}.npz") for c in range(len(case.cameras))]
     noise = ImuNoise(**json.loads((folder / "noise.json").read_text()))
     return detections, load_imu(noise, folder / "imu.npz")
@@ -102,10 +103,12 @@ class Watch:
     compiling: list[tuple[float, float]] = field(default_factory=list)
 
     def progress(self, stage: str, done: int, total: int) -> None:
+        """Note when rounds of the optimisation begin (a `Progress`)."""
         if stage == "optimise":
             self.optimise.append(time.perf_counter())
 
     def compiled(self, event: str, duration_secs: float, **kwargs: Any) -> None:
+        """Note when jax compiled (a listener of `jax.monitoring`)."""
         if event.endswith(COMPILE_EVENTS):
             now = time.perf_counter()
             self.compiling.append((now - duration_secs, now))

@@ -154,6 +154,7 @@ def opencv_inputs(frames: CameraFrames) -> tuple[list[np.ndarray], list[np.ndarr
 
 
 def start_matrix() -> np.ndarray:
+    """The start's camera matrix (3, 3), for OpenCV."""
     return np.array([[START[0], 0, START[2]], [0, START[1], START[3]], [0, 0, 1.0]])
 
 
@@ -167,6 +168,7 @@ def calibrate_opencv(points: list[np.ndarray], pixels: list[np.ndarray]) -> floa
 
 
 def bench_mono() -> None:
+    """One camera, 40 and 200 views, beside `cv2.calibrateCamera` from the same start."""
     for views in (40, 200):
         case = make_case(views, 1)
         inputs = opencv_inputs(case.cameras[0])
@@ -183,6 +185,7 @@ def bench_mono() -> None:
 
 
 def bench_rig() -> None:
+    """Four cameras, 200 and 1000 views, beside Ceres and OpenCV 5."""
     for views in (200, 1000):
         case = make_case(views, 4)
         ours, result = timed(lambda case=case: solve(case.problem, case.state))
@@ -258,6 +261,7 @@ def _bench_multiview(case: Case, views: int, ours: Timing) -> None:
 
 
 def bench_batch() -> None:
+    """Many calibrations with fresh noise in one compiled call, beside as many of OpenCV's."""
     case = make_case(40, 1)
     rng = np.random.default_rng(1)
     (data,) = case.problem.corners
@@ -305,6 +309,7 @@ def make_detections(views: int, cameras: int) -> list[Detections]:
 
 
 def bench_whole() -> None:
+    """`calibrate_cameras` from corners in a file, in new processes."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         path = f"{folder}/corners.npz"
@@ -333,6 +338,7 @@ def peak_mib() -> float:
 
 
 def bench_memory() -> None:
+    """Peak memory over the number of views."""
     for views in (100, 1000, 4000):
         code = (
             f"import sys; sys.path.insert(0, {FOLDER!r}); import bench_cameras as b; "

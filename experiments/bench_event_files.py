@@ -59,6 +59,7 @@ def main() -> int:
 
 
 def print_speed(speed: Speed) -> None:
+    """A row of the table."""
     print(
         f"{speed.name:<22} {speed.megabytes:>8.1f} {speed.whole / 1e6:>10.1f} {speed.windows / 1e6:>10.1f} "
         f"{speed.random_ms:>9.2f}",
@@ -67,6 +68,7 @@ def print_speed(speed: Speed) -> None:
 
 
 def measured(label: str, path: Path) -> Speed:
+    """Events per second read as a whole and in windows, and the time for a window anywhere."""
     with EventFile(path, WIDTH, HEIGHT) as file:  # compiles the decoder and finds the span
         count, (first, last) = len(file), file.span()
     whole = best_of(3, lambda: sum(map(len, opened(path).chunks())))
@@ -82,6 +84,7 @@ def measured(label: str, path: Path) -> Speed:
 
 
 def opened(path: Path) -> EventFile:
+    """The file, opened for the sensor of this benchmark."""
     return EventFile(path, WIDTH, HEIGHT)
 
 
@@ -125,6 +128,7 @@ def bursts(count: int, seed: int = 0) -> Iterator[tuple[np.ndarray, np.ndarray, 
 
 
 def columns(count: int) -> Iterator[EventColumns]:
+    """`count` events or so, in chunks."""
     start = 0
     for t, row, column, polarity in bursts(count):
         n = EVENTS_PER_ROW
@@ -148,6 +152,7 @@ def written(folder: Path, count: int, text_count: int) -> Iterator[tuple[str, Pa
 
 
 def write_raw(path: Path, version: str, words: Iterator[np.ndarray]) -> Path:
+    """A RAW file of `words` with Prophesee's header; returns `path`."""
     with path.open("wb") as file:
         file.write(f"% evt {version}\n% geometry {WIDTH}x{HEIGHT}\n% end\n".encode())
         for part in words:
@@ -167,6 +172,7 @@ def evt3_words(count: int) -> Iterator[np.ndarray]:
 
 
 def evt2_words(count: int) -> Iterator[np.ndarray]:
+    """The events as EVT2."""
     for piece in columns(count):
         t, x, y, p = (values.astype(np.int64) for values in (piece.t_ns // 1000, piece.x, piece.y, piece.p))
         words = np.stack([0x8 << 28 | t >> 6, p << 28 | (t & 0x3F) << 22 | x << 11 | y], axis=1)
@@ -175,6 +181,7 @@ def evt2_words(count: int) -> Iterator[np.ndarray]:
 
 
 def evt21_words(count: int) -> Iterator[np.ndarray]:
+    """The events as EVT2.1."""
     valid = sum(1 << 2 * k for k in range(EVENTS_PER_ROW))
     for t, row, column, polarity in bursts(count):
         upper = np.stack([0x8 << 28 | t >> 6, polarity << 28 | (t & 0x3F) << 22 | column << 11 | row], axis=1)

@@ -121,6 +121,7 @@ def moving_edges(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def endless_windows(count: int) -> Iterator[tuple[int, Events]]:
+    """The same `count` events in window after window of 33 ms."""
     x, y, t, p = moving_edges(count, seed=0)
     number = 0
     while True:

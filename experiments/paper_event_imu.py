@@ -59,6 +59,7 @@ def event_imu_rig(seed: int, duration_s: float) -> SimulatedRig:
 
 
 def figures(options: Any, seed: int, progress: Progress) -> dict[str, Any]:
+    """A row: from events, from ideal frames, and the truth."""
     rig = event_imu_rig(seed, options.duration)
     folder = Path(options.work) / fingerprint(rig)[:16]
     write_recording(rig, folder, progress, workers=1)
@@ -95,10 +96,12 @@ def calibrated(
 
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
+    """The angle between the rotations of two poses, degrees."""
     return float(np.rad2deg(Rotation.from_matrix(a[:3, :3] @ b[:3, :3].T).magnitude()))
 
 
 def table(numbers: list[dict[str, Any]]) -> str:
+    """The rows as markdown, below the paper's."""
     header = ["", "apart (mm)", "(deg)", "(ms)", "events from truth (mm)", "(ms)", "ideal frames from truth (mm)"]
     rows = [["paper", "7.4", "", "", "", "", ""]]
     for row in numbers:

@@ -69,10 +69,12 @@ class Recording:
 
     @property
     def camera(self) -> SimulatedCamera:
+        """The only camera of the scene."""
         return self.rig.cameras[0]
 
     @property
     def target(self) -> Target:
+        """The board of the scene."""
         return self.rig.target
 
     def ideal_frames(self) -> Frames:
@@ -203,6 +205,7 @@ class CornerErrors:
 
     @property
     def speed(self) -> np.ndarray:
+        """How fast each corner moves (N,), px/s."""
         return np.linalg.norm(self.velocity, axis=1)
 
     @property
@@ -231,6 +234,7 @@ class CornerErrors:
 
     @staticmethod
     def together(parts: Iterable["CornerErrors"]) -> "CornerErrors":
+        """All corners of several recordings."""
         parts = list(parts)
         return CornerErrors(np.concatenate([p.errors for p in parts]), np.concatenate([p.velocity for p in parts]))
 

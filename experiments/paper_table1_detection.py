@@ -108,6 +108,7 @@ def figures(found: Outcome) -> dict[str, Any]:
 
 
 def table(outcomes: dict[tuple[str, str], Outcome]) -> str:
+    """Detection, errors and latency as markdown, a row per board and lens."""
     header = ["board", "lens", "paper", "ours", "boards found", "corners", "median error (px)", "ideal", "latency (ms)"]
     rows = []
     for (board, lens), found in outcomes.items():

@@ -100,10 +100,12 @@ def lens_of(recording: Recording, detections: Detections) -> Lens:
 
 
 def plain(lens: Lens) -> dict[str, Any]:
+    """The numbers of a lens, for JSON."""
     return {name: np.asarray(value).tolist() for name, value in vars(lens).items()}
 
 
 def table(rows: dict[tuple[str, str], tuple[list[Lens], list[Lens]]]) -> str:
+    """The worst of the seeds as markdown, a row per board and lens."""
     header = [
         "board",
         "lens",

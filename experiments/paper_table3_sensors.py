@@ -135,6 +135,7 @@ def reprojection_rms_px(recording: Recording, detections: Detections) -> float:
 
 
 def table(numbers: list[dict[str, Any]]) -> str:
+    """Boards found and reprojection errors as markdown, a row per sensor."""
     methods = ("network", *METHODS, "ideal")
     header = ["sensor", "paper, E2VID: rms (px)"]
     for method in methods:

@@ -119,6 +119,7 @@ def matched(corners: np.ndarray | None, truth: np.ndarray) -> np.ndarray | None:
 
 
 def together(parts: Sequence[CornerErrors]) -> CornerErrors:
+    """All corners of several images."""
     return CornerErrors(
         np.concatenate([part.errors for part in parts]),
         np.concatenate([part.velocity for part in parts]),

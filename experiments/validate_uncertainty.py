@@ -50,6 +50,7 @@ class Truth:
 
     @property
     def T_cam_cam0(self) -> list[np.ndarray]:
+        """Poses (4, 4) of the cameras against the first one."""
         return [pose[0] @ np.linalg.inv(self.poses[0][0]) for pose in self.poses]
 
 
@@ -356,6 +357,7 @@ def _slopes(lens: CameraModel, points: Float[Array, "M 3"]) -> Float[Array, "M 2
 
 
 def parameter_table(scatter: Scatter, noise_px: float) -> str:
+    """Observed over stated scatter of each parameter, as markdown."""
     error = 1.0 / np.sqrt(2.0 * len(scatter.errors))
     lines = ["| parameter | stated sigma | observed / stated | bias in sigmas |", "|---|---|---|---|"]
     bias = scatter.errors.mean(axis=0) / np.sqrt(np.mean(scatter.sigmas**2, axis=0))
@@ -373,6 +375,7 @@ def parameter_table(scatter: Scatter, noise_px: float) -> str:
 
 
 def projection_table(truth: Truth, scatter: Scatter, camera: int, range_m: float | None) -> str:
+    """The same for projections over the image of a camera."""
     pixels = grid_over(truth.frames[camera])
     observed, stated = projection_scatter(truth, scatter, camera, pixels, range_m)
     ratio = np.sqrt(np.trace(observed, axis1=1, axis2=2) / np.trace(stated, axis1=1, axis2=2))

@@ -235,6 +235,7 @@ class ToneCurve:
         self._recent: deque[tuple[float, float]] = deque(maxlen=median_size + 1)
 
     def reset(self) -> None:
+        """Forget the ranges of the images so far."""
         self._recent.clear()
 
     def __call__(self, image: torch.Tensor) -> torch.Tensor:

@@ -54,7 +54,9 @@ class FramePoses(eqx.Module):
 class PoseSource(Protocol):
     """Where the pose of a frame comes from."""
 
-    def poses(self, state: RigState, data: VisionData) -> FramePoses: ...
+    def poses(self, state: RigState, data: VisionData) -> FramePoses:
+        """The poses of the frames of `data`, and what they are made of."""
+        ...
 
 
 def view_poses(state: RigState, data: VisionData) -> FramePoses:

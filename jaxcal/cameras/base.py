@@ -101,6 +101,7 @@ class CameraModel(eqx.Module):
 
     @property
     def num_parameters(self) -> int:
+        """How many numbers the model has: projection and distortion together."""
         return sum(np.size(getattr(self, f.name)) for f in _fields(self))
 
     @property

@@ -23,7 +23,9 @@ from jaxcal.targets import Target
 class Fingerprinted(Protocol):
     """Images that can say cheaply whether they are still the same ones."""
 
-    def fingerprint(self) -> str: ...
+    def fingerprint(self) -> str:
+        """A text that changes with any of the images."""
+        ...
 
 
 def detection_key(frames: Frames, target: Target) -> str:
@@ -52,6 +54,7 @@ class DetectionCache:
 
     @property
     def path(self) -> Path:
+        """The file that holds the detections once they are complete."""
         return self.folder / f"{self.name}-{self.key[:16]}.detections.npz"
 
     @property

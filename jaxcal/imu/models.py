@@ -38,6 +38,7 @@ class ImuModel:
 
     @property
     def size(self) -> int:
+        """How many numbers the model has."""
         return len(self.nominal)
 
     def labels(self) -> list[str]:

@@ -39,6 +39,7 @@ class StillRecording:
 
     @property
     def duration_s(self) -> float:
+        """Length of the recording, s."""
         return self.gyro_rad_s.shape[1] / self.rate_hz
 
 

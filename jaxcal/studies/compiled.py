@@ -51,6 +51,7 @@ class Batch:
 
     @property
     def num_views(self) -> int:
+        """Views of the calibration that the runs draw from."""
         return self.known.num_views
 
 

@@ -34,6 +34,7 @@ class Block:
 
     @property
     def is_pose(self) -> bool:
+        """Whether `values` are a (4, 4) pose."""
         return self.values.shape == (4, 4)
 
     @property

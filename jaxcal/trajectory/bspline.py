@@ -125,6 +125,7 @@ class PoseSpline(eqx.Module):
 
     @property
     def num_intervals(self) -> int:
+        """Knot intervals in which the spline is defined."""
         return self.rotations.shape[0] - self.order + 1
 
     def locate(self, t: Float[Array, "*n"]) -> tuple[Array, Array]:

@@ -49,6 +49,7 @@ class Stage:
 
     @property
     def steps(self) -> int:
+        """Optimiser steps."""
         return self.clips * self.segments
 
 
@@ -83,6 +84,7 @@ class Recipe:
 
     @property
     def steps(self) -> int:
+        """Optimiser steps of all stages, without the parent's."""
         return sum(stage.steps for stage in self.stages)
 
     def describe(self) -> str:
