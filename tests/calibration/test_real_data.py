@@ -239,28 +239,32 @@ _PLACE = ("T_cam_imu", "timeshift_cam_imu")
 
 
 def test_euroc_with_imu_noise_estimated_does_not_depend_on_the_knots(data_folder: Path) -> None:
-    """Denser knots follow the IMU further, and tell the same of the cameras. (Residuals that hang together were once
-    held against the IMU, until it counted for nothing: 0.1 deg, 4 mm and 0.25 ms from 70 to 100 knots a second.)"""
-    detections, imu, target = _euroc(data_folder)
-    start = int(imu.timestamps_ns[0])
-    part = [d.of_frames(d.timestamps_ns < start + 12_000_000_000) for d in detections]
+    """Denser knots follow the IMU further, and tell the same of the camera, well within its sigmas. (Residuals that
+    hang together were once held against the IMU, until it counted for nothing: 0.17 deg, 8.5 mm and 0.13 ms here.)"""
+    (detections, _), imu, target = _euroc(data_folder)
+    part = detections.of_frames(detections.timestamps_ns < int(imu.timestamps_ns[0]) + 12_000_000_000)
     sparse, dense = (
         calibrate_camera_imu(
-            part, imu, target, models=["pinhole-radtan5"] * 2, board_warp=True, imu_noise="estimated", knot_rate_hz=rate
-        )
+            [part],
+            imu,
+            target,
+            models=["pinhole-radtan5"],
+            board_warp=True,
+            imu_noise="estimated",
+            knot_rate_hz=rate,
+        ).cameras[0]
         for rate in (70.0, 100.0)
     )
-    for a, b in zip(sparse.cameras, dense.cameras, strict=True):
-        assert a.T_cam_imu is not None
-        assert b.T_cam_imu is not None
-        assert a.timeshift_cam_imu is not None
-        assert b.timeshift_cam_imu is not None
-        turn = Rotation.from_matrix(b.T_cam_imu[:3, :3] @ a.T_cam_imu[:3, :3].T).as_rotvec()
-        moved = np.linalg.inv(b.T_cam_imu)[:3, 3] - np.linalg.inv(a.T_cam_imu)[:3, 3]
-        log.info("%s: %.3f deg, %.2f mm", a.name, *_norms(turn, moved))
-        assert np.degrees(np.linalg.norm(turn)) < 0.02
-        assert np.linalg.norm(moved) < 1e-3
-        assert abs(b.timeshift_cam_imu - a.timeshift_cam_imu) < 0.02e-3
+    assert sparse.T_cam_imu is not None
+    assert dense.T_cam_imu is not None
+    assert sparse.timeshift_cam_imu is not None
+    assert dense.timeshift_cam_imu is not None
+    turn = Rotation.from_matrix(dense.T_cam_imu[:3, :3] @ sparse.T_cam_imu[:3, :3].T).as_rotvec()
+    moved = np.linalg.inv(dense.T_cam_imu)[:3, 3] - np.linalg.inv(sparse.T_cam_imu)[:3, 3]
+    log.info("%.3f deg, %.2f mm", *_norms(turn, moved))
+    assert np.degrees(np.linalg.norm(turn)) < 0.04
+    assert np.linalg.norm(moved) < 2e-3
+    assert abs(dense.timeshift_cam_imu - sparse.timeshift_cam_imu) < 0.04e-3
 
 
 def _norms(turn: np.ndarray, moved: np.ndarray) -> tuple[float, float]:
