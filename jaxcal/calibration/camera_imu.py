@@ -125,9 +125,8 @@ def calibrate_camera_imu(
         progress=progress,
         reweigh=noise.reweigh,
     )
-    covariance, chain, sentences = chain_covariance_and_sentences(
-        fit, names, lenses, frames, noise.excesses(fit.problem, fit.state)
-    )
+    excesses = noise.excesses(fit.problem, fit.state)
+    covariance, chain, sentences = chain_covariance_and_sentences(fit, names, lenses, frames, excesses)
     results = imu_results.imu_calibrations(fit, imus, noise, chain, grid)
     settings = {
         "job": "calibrate_camera_imu",
@@ -153,7 +152,7 @@ def calibrate_camera_imu(
         target,
         covariance=with_common_delay(covariance, layout, stamp_sigmas, to_first_camera=False),
         imus=results,
-        warnings=[*sentences, *noise.warnings(fit)],
+        warnings=[*sentences, *noise.warnings(fit, excesses)],
         settings=settings,
     )
 

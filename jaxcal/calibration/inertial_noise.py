@@ -93,11 +93,10 @@ class NoiseModel:
             found.append(np.array([in_band_excess(residuals[:, s], readings[:, s]) for s in (slice(3), slice(3, 6))]))
         return found
 
-    def warnings(self, fit: RobustFit) -> list[str]:
-        """Sentences where the noise is clearly larger than stated, or errs with the motion."""
+    def warnings(self, fit: RobustFit, excesses: Sequence[np.ndarray]) -> list[str]:
+        """Sentences where the noise is clearly larger than stated, or errs with the motion (`excesses`)."""
         sentences = []
-        ratios, excesses = self.ratios(fit.problem, fit.state), self.excesses(fit.problem, fit.state)
-        for i, (ratio, excess) in enumerate(zip(ratios, excesses, strict=True)):
+        for i, (ratio, excess) in enumerate(zip(self.ratios(fit.problem, fit.state), excesses, strict=True)):
             which = "" if len(self.binned) == 1 else f"imu{i}: "
             done = "the stated noise was used all the same" if self.choice == "given" else "the larger noise was used"
             sentences += [

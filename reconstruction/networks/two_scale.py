@@ -4,6 +4,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from torch import nn
 
 from reconstruction.networks.base import ReconstructionNetwork, State
 from reconstruction.networks.blocks import ConvLayer
@@ -16,11 +17,13 @@ class TwoScaleNet(ReconstructionNetwork):
     The body costs a quarter of what it does on 2 x 2 blocks, and so does its memory: the sixteen pixels of a block
     share `channels` numbers. Where edges lie to a fraction of a pixel is in the events of this window, which reach the
     tail by `detail` channels of the head; where nothing moves for some windows, more is forgotten than by
-    FoldedFireNet. The output is not squashed: about 0.05 for the pattern's black and 0.95 for its white.
+    FoldedFireNet (see TwoScaleMemoryNet). The output is not squashed: about 0.05 for the pattern's black and 0.95 for
+    its white.
     """
 
     reduced_precision = True
     multiple = 4
+    remembers = False
 
     def __init__(
         self,
@@ -42,16 +45,28 @@ class TwoScaleNet(ReconstructionNetwork):
             "shown_at": self.shown_at,
         }
         self.head = ConvLayer(4 * self.num_bins + (scaling == "running+scale"), detail, 3)
+        kept = int(detail) if self.remembers else 0
         self.body = FireBody(
-            4 * detail, 4 * detail, channels=int(channels), num_residual_blocks=2, recurrent_residual=[]
+            4 * (detail + kept), 4 * detail, channels=int(channels), num_residual_blocks=2, recurrent_residual=[]
         )
-        self.tail = ConvLayer(2 * detail, detail, 3)
+        self.tail = ConvLayer(2 * detail + kept, detail, 3)
+        if self.remembers:
+            self.gate = nn.Conv2d(3 * detail, detail, 3, padding=1)
+            nn.init.constant_(self.gate.bias, 2.0)  # pyright: ignore[reportArgumentType]  # starts by remembering little
         self.pred = ConvLayer(detail, 4, 3, relu=False)
 
     def forward(self, voxels: torch.Tensor, state: State | None) -> tuple[torch.Tensor, State]:
+        """Images (B, 1, H, W) of voxel grids (B, planes, H, W), and the state: the body's, and what the tail keeps."""
         bins, scale = voxels[:, : self.num_bins], voxels[:, self.num_bins :, ::2, ::2]
         head = self.head(torch.cat([F.pixel_unshuffle(bins, 2), scale], dim=1))
-        coarse, after = self.body(F.pixel_unshuffle(head, 2), state)
-        joined = self.tail(torch.cat([head, F.pixel_shuffle(coarse, 2).to(head.dtype)], dim=1))
+        before, kept = (None, torch.zeros_like(head)) if state is None else (state[:1], state[-1])
+        seen = [kept.to(head.dtype)] if self.remembers else []
+        coarse, after = self.body(F.pixel_unshuffle(torch.cat([head, *seen], dim=1), 2), before)
+        both = torch.cat([head, F.pixel_shuffle(coarse, 2).to(head.dtype), *seen], dim=1)
+        joined = self.tail(both)
+        if self.remembers:
+            # In float32: what changes slowly does so by less than bfloat16's eight bits.
+            joined = torch.lerp(kept.float(), joined.float(), torch.sigmoid(self.gate(both)).float())
+            after = [*after, joined]
         with torch.autocast(joined.device.type, enabled=False):  # grey levels need more than bfloat16's eight bits
             return F.pixel_shuffle(self.pred(joined.float()), 2), after
