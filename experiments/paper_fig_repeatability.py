@@ -38,7 +38,7 @@ PAPER_MM = 5.0
 # 1-sigma by which cameras turn (deg) and lenses change (share of the focal length) from recording to recording.
 TURN_DEG, LENS_SHARE = 0.2, 0.002
 # Noise of a corner coordinate (px) in frames from events and in images, as the full pipeline shows it (README).
-CORNER_NOISE_PX = {"events": 0.12, "frames": 0.011}
+CORNER_NOISE_PX = {"events": 0.063, "frames": 0.007}
 
 
 def main() -> int:

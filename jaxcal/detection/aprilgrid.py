@@ -153,8 +153,8 @@ def _cell_samples() -> np.ndarray:
 def _read_cells(image: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Mean grey level (Q, 10, 10) of each cell of quadrilaterals (Q, 4, 2) given in Kalibr's order."""
     unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], np.float32)
-    maps = [cv2.getPerspectiveTransform(unit, quad) for quad in corners.astype(np.float32)]
-    places = np.stack([apply_homography(homography, _cell_samples()) for homography in maps])
+    maps = np.stack([cv2.getPerspectiveTransform(unit, quad) for quad in corners.astype(np.float32)])
+    places = apply_homography(maps, _cell_samples())
     x, y = np.moveaxis(places.astype(np.float32), -1, 0)
     grey = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     cells = grey.reshape(len(corners), _CELLS, _SAMPLES_PER_CELL, _CELLS, _SAMPLES_PER_CELL)

@@ -150,10 +150,10 @@ def _measured(image: np.ndarray, centres: np.ndarray, target: CircleGrid) -> tup
     near = order[:, : min(_NEIGHBOURS, len(board))]
     start, trusted = centres, np.ones(len(board), bool)
     for _ in range(_PASSES):
-        maps = np.stack([fit_homography(board[some], centres[some]) for some in near])
-        place = np.stack([apply_homography(np.linalg.inv(H), c) for H, c in zip(maps, centres, strict=True)])
+        maps = fit_homography(board[near], centres[near])
+        place = apply_homography(np.linalg.inv(maps), centres[:, None])[:, 0]
         moved, trusted = _centres_of_darkness(image, maps, place, reach)
-        centres = np.stack([apply_homography(H, p) for H, p in zip(maps, moved, strict=True)])
+        centres = apply_homography(maps, moved[:, None])[:, 0]
     scale = np.linalg.norm(centres[near[:, 1]] - centres, axis=1)
     size = np.array([image.shape[1], image.shape[0]])
     inside = ((centres > 1.0) & (centres < size - 2.0)).all(axis=1)
@@ -171,7 +171,7 @@ def _centres_of_darkness(
     side = int(np.clip(np.ceil(4.0 * reach * float(np.median(px_per_m))), 16, _MAX_SIDE))
     line = (np.arange(side) + 0.5) / side * 2.0 - 1.0
     offset = reach * np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    pixels = np.stack([apply_homography(H, p + offset) for H, p in zip(maps, place, strict=True)])
+    pixels = apply_homography(maps, place[:, None] + offset)
     u, v = np.moveaxis(pixels.astype(np.float32), -1, 0)
     grey = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
     distance = np.linalg.norm(offset, axis=1)
@@ -194,7 +194,7 @@ def _px_per_metre(maps: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Pixels per metre (N,) around each place, the least over directions."""
     step = 1e-6
     steps = np.array([[0.0, 0.0], [step, 0.0], [0.0, step]])
-    moved = np.stack([apply_homography(H, p + steps) for H, p in zip(maps, place, strict=True)])
+    moved = apply_homography(maps, place[:, None] + steps)
     jacobian = (moved[:, 1:] - moved[:, :1]) / step
     return np.maximum(np.linalg.svd(jacobian, compute_uv=False)[:, -1], 1e-9)
 

@@ -54,3 +54,7 @@ def test_homographies_are_recovered(seed: int, count: int) -> None:
     destination = apply_homography(truth, source)
     found = fit_homography(source, destination)
     assert np.allclose(found / found[2, 2], truth / truth[2, 2], rtol=1e-5, atol=1e-5)
+    mapped = apply_homography(found, source)
+    assert np.abs(mapped - destination).max() < 1e-9 * np.abs(destination).max()
+    stacked = fit_homography(np.stack([source, source[::-1]]), np.stack([destination, destination[::-1]]))
+    assert np.allclose(apply_homography(stacked, source), destination, rtol=1e-9)
