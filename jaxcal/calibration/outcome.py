@@ -14,7 +14,7 @@ from jaxcal.calibration.lens_basis import to_parameters
 from jaxcal.calibration.problem import camera_poses
 from jaxcal.calibration.robust import RobustFit
 from jaxcal.calibration.rolling import check_readout
-from jaxcal.calibration.score_noise import design_effect
+from jaxcal.calibration.score_noise import ScoreNoise, score_noise
 from jaxcal.calibration.state import RigState, SharedLayout, camera_model_of, transform
 from jaxcal.calibration.target_shape import target_points
 from jaxcal.calibration.view_noise import LEAN, share_of_place
@@ -37,13 +37,24 @@ def chain_covariance_and_sentences(
     Corners that hang together, and IMUs whose gyro and accel err with the motion by `imu_effects` (2,) each (factors of
     their variance), tell less than least squares took from them: covariances allow for that.
     """
-    labels = uncertainty.labels_of(names, models, fit.problem.layout)
-    effects = _design_effects(fit, cameras)
-    as_weighted = max(effects) == 1.0 and all((effect == 1.0).all() for effect in imu_effects)
-    equations = fit.result.equations if as_weighted else _equations_of_less(fit, cameras, effects, imu_effects)
-    covariance, chain, sentences = uncertainty.shared_covariance(
-        equations, np.asarray(fit.problem.free), labels, to_parameters(fit.problem.basis, fit.problem.layout)
-    )
+    layout = fit.problem.layout
+    basis = to_parameters(fit.problem.basis, layout)
+    known_as = (np.asarray(fit.problem.free), uncertainty.labels_of(names, models, layout), basis)
+    noises = _score_noises(fit, cameras)
+    # Views that repeat each other's errors got relative weights, which claim too much by `inflation` in any case.
+    effects = [
+        max(1.0 if noise is None else noise.effect, known.inflation)
+        for noise, known in zip(noises, fit.redundancy, strict=True)
+    ]
+    covariance, chain, sentences = uncertainty.shared_covariance(fit.result.equations, *known_as)
+    response = covariance
+    if max(effects) > 1.0 or any((effect != 1.0).any() for effect in imu_effects):
+        less = _equations_of_less(fit, cameras, effects, imu_effects)
+        covariance, chain, sentences = uncertainty.shared_covariance(less, *known_as)
+    for c, (noise, effect) in enumerate(zip(noises, effects, strict=True)):
+        if noise is not None:
+            by_score = response[:, layout.lens(c)]
+            covariance = covariance + by_score @ noise.beyond(effect) @ by_score.T
     for name, redundancy, effect in zip(names, fit.redundancy, effects, strict=True):
         if effect == 1.0:
             continue
@@ -61,15 +72,14 @@ def chain_covariance_and_sentences(
     return covariance, chain, sentences
 
 
-def _design_effects(fit: RobustFit, cameras: Sequence[CameraFrames]) -> list[float]:
-    """By how much the corners of each camera tell less than their weights say."""
+def _score_noises(fit: RobustFit, cameras: Sequence[CameraFrames]) -> list[ScoreNoise | None]:
+    """How the scores of each camera's lens scatter; None where they do as its corners' weights say."""
     problem, state, layout = fit.problem, fit.state, fit.problem.layout
     poses = split_groups(layout, cameras, [np.asarray(part) for part in camera_poses(problem, state)])
     points = np.asarray(target_points(problem.geometry, state.target))
     models = [camera_model_of(state, layout, problem.templates, c) for c in range(layout.num_cameras)]
-    parts = zip(models, poses, fit.errors, _corner_weights(fit, cameras), fit.redundancy, strict=True)
-    # Views that repeat each other's errors got relative weights, which claim too much by `inflation` in any case.
-    return [max(design_effect(model, points, *own), known.inflation) for model, *own, known in parts]
+    parts = zip(models, poses, fit.errors, _corner_weights(fit, cameras), strict=True)
+    return [score_noise(model, points, *own) for model, *own in parts]
 
 
 def _equations_of_less(

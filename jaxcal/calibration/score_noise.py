@@ -3,10 +3,15 @@
 Corners of one view that err together (a lens model too lean, a board that is not flat, a network that makes frames of
 events), and views that err like the ones before them, tell less than their number says. What counts for the lens is
 its score, the gradient of the cost by its parameters: over all views, scores of independent corners scatter as the
-information matrix says. Here the scatter is measured, view by view and over neighbours in time (the "sandwich" of
+information matrix says. Whether they scatter more is tested view by view and over neighbours in time (the "sandwich" of
 White 1980 with the weights over lags of Newey and West 1987, "A simple, positive semi-definite, heteroskedasticity and
-autocorrelation consistent covariance matrix", eq. 5), and compared with that matrix.
+autocorrelation consistent covariance matrix", eq. 5). Where they do, by how much, and in which directions, is what the
+lens does when one stretch of the recording after another is left out (the delete-a-group jackknife, Shao and Tu 1995,
+"The jackknife and bootstrap", eq. 2.18): unlike the sandwich it sees errors that last as long as a stretch, and allows
+for the share of its own errors that the lens has followed.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,8 +25,33 @@ _BEYOND_CHANCE = 5.0
 # Of lenses with very many parameters so many are looked at, evenly chosen.
 _MOST_PARAMETERS = 24
 _FEWEST_VIEWS = 8
+# Stretches of the recording that are left out in turn.
+_STRETCHES = 12
+# A direction that one stretch alone tells is not known without it; its step is held to the inverse of this share.
+_LEAST_LEFT = 0.1
 _FEWEST_CORNERS = 6
 _AT_ONCE = 2_000_000  # derivatives, for memory
+
+
+@dataclass(frozen=True)
+class ScoreNoise:
+    """How the score of a lens scatters.
+
+    `effect`: the mean over directions of its variance beside that of independent corners, 1 where these are so;
+    `scatter` (D, D): its covariance in the coordinates in which that of independent corners is the identity;
+    `directions` (P, D): from these coordinates to derivatives of the cost by the lens's parameters.
+    """
+
+    effect: float
+    scatter: np.ndarray
+    directions: np.ndarray
+
+    def beyond(self, effect: float) -> np.ndarray:
+        """Covariance (P, P) of the score where it scatters by more than `effect` times what independent corners show:
+        in a few directions it may be far more than in the mean."""
+        values, vectors = np.linalg.eigh(self.scatter)
+        along = self.directions @ vectors
+        return (along * np.maximum(values - effect, 0.0)) @ along.T
 
 
 def design_effect(
@@ -29,39 +59,68 @@ def design_effect(
 ) -> float:
     """By what factor the covariance of a lens is larger than its information says; 1 where corners are independent.
 
+    The mean over the directions of the lens (Kish's design effect). Arguments as for `score_noise`.
+    """
+    found = score_noise(model, points, poses, errors, weights)
+    return 1.0 if found is None else found.effect
+
+
+def score_noise(
+    model: CameraModel, points: np.ndarray, poses: np.ndarray, errors: np.ndarray, weights: np.ndarray
+) -> ScoreNoise | None:
+    """How the score of a lens scatters; None where it does so as with independent corners, or too little is seen.
+
     `points` (N, 3) of the target, m; `poses` (F, 4, 4) T_cam_target in the order of time; `errors` (F, N, 2) projection
     minus measurement, px; `weights` (F, N) of the least squares, px^-2, zero for corners that take no part. The poses
-    are taken for free. The factor is the mean over the directions of the lens (Kish's design effect).
+    are taken for free.
     """
     taken = np.flatnonzero((weights > 0).sum(axis=1) >= _FEWEST_CORNERS)
     if len(taken) < _FEWEST_VIEWS:
-        return 1.0
+        return None
+    chosen = _chosen(model)
     views = max(_AT_ONCE // (len(points) * len(np.asarray(model.parameters))), 1)
     parts = [
-        _scores(model, points, poses[some], errors[some], weights[some])
+        _scores(model, chosen, points, poses[some], errors[some], weights[some])
         for some in np.array_split(taken, -(-len(taken) // views))
     ]
     scores, of_views = (np.concatenate(part) for part in zip(*parts, strict=True))
     fine = np.isfinite(scores).all(axis=1) & np.isfinite(of_views).all(axis=(1, 2))
     if fine.sum() < _FEWEST_VIEWS:
-        return 1.0
+        return None
     scores, of_views = scores[fine], of_views[fine]
     information = of_views.sum(axis=0)
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     told = values > 1e-10 * values[-1]  # directions that nothing is known of say nothing here
     whitened = vectors[:, told] / np.sqrt(values[told]) / scale[:, None]
-    return _scatter(scores @ whitened, whitened.T @ of_views @ whitened)
+    scores, of_views = scores @ whitened, whitened.T @ of_views @ whitened
+    if not _beyond_chance(scores, of_views):
+        return None
+    scatter = _jackknife(scores, of_views)
+    directions = np.zeros((len(np.asarray(model.parameters)), len(scatter)))
+    directions[chosen] = information @ whitened
+    return ScoreNoise(max(float(np.trace(scatter)) / len(scatter), 1.0), scatter, directions)
+
+
+def _chosen(model: CameraModel) -> np.ndarray:
+    """The parameters that are looked at."""
+    count = len(np.asarray(model.parameters))
+    return np.linspace(0, count - 1, min(count, _MOST_PARAMETERS)).astype(int)
 
 
 def _scores(
-    model: CameraModel, points: np.ndarray, poses: np.ndarray, errors: np.ndarray, weights: np.ndarray
+    model: CameraModel,
+    chosen: np.ndarray,
+    points: np.ndarray,
+    poses: np.ndarray,
+    errors: np.ndarray,
+    weights: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The score (F, P) of the lens in each view, with the view's pose free, and its covariance (F, P, P) were errors
-    independent. Arguments as for `design_effect`."""
+    """The score (F, P) of the lens's parameters `chosen` in each view, with the view's pose free, and its covariance
+    (F, P, P) were errors independent. The other arguments as for `score_noise`."""
     root = np.sqrt(weights)[..., None]
     seen = np.where(root > 0, np.einsum("fij,nj->fni", poses[:, :3, :3], points) + poses[:, None, :3, 3], 1.0)
-    by_lens, by_pose = _derivatives(model, seen)
+    by_lens, by_pose = _derivatives(model, chosen, seen)
     by_lens, by_pose, error = (
         (np.where(root[..., None] > 0, part, 0.0) * root[..., None]).reshape(len(poses), -1, part.shape[-1])
         for part in (by_lens, by_pose, errors[..., None])
@@ -71,9 +130,9 @@ def _scores(
     return (by_lens.swapaxes(1, 2) @ error)[..., 0], by_lens.swapaxes(1, 2) @ by_lens
 
 
-def _scatter(scores: np.ndarray, expected: np.ndarray) -> float:
-    """The variance of the sum of scores (V, P), mean over the directions, in each of which it would be one were the
-    scores independent with covariances `expected` (V, P, P); 1 where it is so but for chance."""
+def _beyond_chance(scores: np.ndarray, expected: np.ndarray) -> bool:
+    """Whether the sum of scores (V, D) varies more than it would by chance were the scores independent with covariances
+    `expected` (V, D, D), which add up to the identity."""
     views, directions = scores.shape
     lags = int(np.ceil(_LAGS * views))
     total, by_chance = np.sum(scores**2), 2.0 * np.sum(expected**2)
@@ -81,15 +140,23 @@ def _scatter(scores: np.ndarray, expected: np.ndarray) -> float:
         weight = 1.0 - lag / (lags + 1.0)
         total += 2.0 * weight * np.sum(scores[lag:] * scores[:-lag])
         by_chance += 4.0 * weight**2 * np.sum(expected[lag:] * expected[:-lag])
-    found = float(total / directions)
-    return found if found > 1.0 + _BEYOND_CHANCE * np.sqrt(by_chance) / directions else 1.0
+    return bool(total / directions > 1.0 + _BEYOND_CHANCE * np.sqrt(by_chance) / directions)
 
 
-def _derivatives(model: CameraModel, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _jackknife(scores: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Covariance (D, D) of the sum of scores from how the optimum moves when stretches of the views are left out."""
+    stretches = np.array_split(np.arange(len(scores)), min(_STRETCHES, len(scores)))
+    left, vectors = np.linalg.eigh(np.eye(scores.shape[1]) - np.stack([expected[s].sum(axis=0) for s in stretches]))
+    own = np.stack([scores[s].sum(axis=0) for s in stretches])
+    turned = np.einsum("sij,si->sj", vectors, own) / np.maximum(left, _LEAST_LEFT)
+    moved = np.einsum("sij,sj->si", vectors, turned)
+    return (1.0 - 1.0 / len(stretches)) * moved.T @ moved
+
+
+def _derivatives(model: CameraModel, chosen: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of the pixels of points (F, N, 3) in the camera's frame by the lens (F, N, 2, P) and by the pose
     (F, N, 2, 6), rotation first; zeros where a point cannot be projected."""
     parameters = np.asarray(model.parameters)
-    chosen = np.linspace(0, len(parameters) - 1, min(len(parameters), _MOST_PARAMETERS)).astype(int)
     found = ModelLens(model).project(parameters[None], seen.swapaxes(-1, -2)[None], True)
     assert found.by_lens is not None
     by_lens = np.transpose(found.by_lens[0][:, chosen], (0, 3, 2, 1))

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxcal.calibration.score_noise import design_effect
+from jaxcal.calibration.score_noise import _jackknife, design_effect, score_noise
 from jaxcal.cameras import CameraModel, PinholeRadtan
 from jaxcal.targets import Checkerboard
 
@@ -46,7 +46,7 @@ def test_independent_corners_tell_in_full(seed: int) -> None:
 @pytest.mark.parametrize("kept", [0.5, 0.9])
 def test_errors_that_last_from_view_to_view_tell_less(kept: float) -> None:
     # Errors that keep the share `kept` from one view to the next, in the same pose, are known exactly: a lag l adds
-    # twice kept^l. A share of the lags is looked at, with weights that fall to zero.
+    # twice kept^l, as far as a twelfth of the recording reaches.
     rng = np.random.default_rng(1)
     views = 400
     T = np.tile(poses(rng, 1), (views, 1, 1))
@@ -54,9 +54,49 @@ def test_errors_that_last_from_view_to_view_tell_less(kept: float) -> None:
     errors = [fresh[0]]
     for new in fresh[1:]:
         errors.append(kept * errors[-1] + np.sqrt(1 - kept**2) * new)
-    lags = np.arange(1, 21)
-    expected = 1.0 + 2.0 * np.sum((1.0 - lags / 21.0) * kept**lags)
+    stretch = views / 12
+    lags = np.arange(1, int(stretch))
+    expected = 1.0 + 2.0 * np.sum((1.0 - lags / stretch) * kept**lags)
     assert effect(NOISE_PX * np.array(errors), T) == pytest.approx(expected, rel=0.35)
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.6, 0.9])
+def test_what_leaving_out_stretches_shows_is_how_far_the_optimum_is_off(kept: float) -> None:
+    """Scores of views of very different weight, each last for a while, and a lens that has followed them."""
+    rng = np.random.default_rng(6)
+    views, size = 120, 4
+    root = rng.standard_normal((views, 8, size)) * np.exp(0.7 * rng.standard_normal((views, 1, 1)))
+    information = np.einsum("vki,vkj->vij", root, root)
+    back = np.linalg.inv(np.linalg.cholesky(information.sum(axis=0))).T
+    root, information = root @ back, back.T @ information @ back
+    off, said = [], []
+    for _ in range(150):
+        noise = rng.standard_normal((views, 8))
+        for v in range(1, views):
+            noise[v] = kept * noise[v - 1] + np.sqrt(1 - kept**2) * noise[v]
+        scores = np.einsum("vki,vk->vi", root, noise)
+        # All residuals of a view change sign with its root, so that errors last in the noise and in the score.
+        optimum = scores.sum(axis=0)
+        off.append(optimum @ optimum)
+        said.append(np.trace(_jackknife(scores - information @ optimum, information)))
+    assert np.mean(said) == pytest.approx(np.mean(off), rel=0.3)
+
+
+def test_a_direction_that_scatters_more_than_the_others_is_told() -> None:
+    """The lens's k1 is another one in each view: that, and k2 with it, is what the recording tells less of."""
+    rng = np.random.default_rng(7)
+    T = poses(rng)
+    seen = np.einsum("fij,nj->fni", T[:, :3, :3], POINTS) + T[:, None, :3, 3]
+    other = LENS.with_parameters(np.asarray(LENS.parameters) + 1e-3 * np.eye(8)[4])
+    by_k1 = np.asarray(other.project(seen)) - np.asarray(LENS.project(seen))
+    errors = NOISE_PX * rng.standard_normal(by_k1.shape) + 60.0 * rng.standard_normal((VIEWS, 1, 1)) * by_k1
+    found = score_noise(LENS, POINTS, T, errors, weights())
+    assert found is not None
+    covariance = np.linalg.inv(found.directions @ found.directions.T)
+    more = np.diag(covariance @ found.beyond(found.effect) @ covariance) / np.diag(covariance)
+    radial, others = more[4:6], np.delete(more, [4, 5])
+    assert radial.min() > 2.0 * others.max()
+    assert radial.min() > found.effect
 
 
 def test_errors_that_a_view_shares_tell_less() -> None:
