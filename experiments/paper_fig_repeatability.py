@@ -1,14 +1,15 @@
 """The e2calib paper's repeatability figure: a four-camera hybrid rig, eleven recordings, translation against CAD.
 
     python experiments/paper_fig_repeatability.py --corners            # simulated corners: minutes
-    python experiments/paper_fig_repeatability.py --out study/         # simulated events and images: some minutes each
+    python experiments/paper_fig_repeatability.py --out study/         # simulated events and images: two minutes each
 
 Muglikar, Gehrig, Gehrig and Scaramuzza, "How to Calibrate Your Event Camera", CVPRW 2021, calibrate a rig of two event
 cameras and two frame cameras in 11 recordings, between which cameras turn and lenses change slightly, and hold the
 translations against the CAD drawing: within 5 mm. Here the rig is the built-in one, and its drawing is the truth. In
 each recording every camera is turned about its own centre by random angles, and its lens changed by some parts in a
-thousand; the centres stay. Results are turned back by the true angles, so that their translations can be compared with
-the drawing's along its own axes, and go through `jaxcal.studies` as repeated recordings: a table and box plots.
+thousand; the centres stay. Results are turned back by the true angles and their lenses moved back by the true changes,
+so that all of them can be compared with the drawing, and go through `jaxcal.studies` as repeated recordings: a table
+and box plots.
 
 With --corners, corners are simulated with the noise that cameras of each kind show in the full pipeline. Without it,
 events and images are simulated, frames reconstructed and corners detected. What is done is kept in --out: an
@@ -19,9 +20,11 @@ import argparse
 import dataclasses
 import itertools
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from paper_scenes import into_readme
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
@@ -47,6 +50,7 @@ def main() -> int:
     parser.add_argument("--recordings", type=int, default=RECORDINGS)
     parser.add_argument("--duration", type=float, default=8.0, help="of each recording, s")
     parser.add_argument("--out", type=Path, help="folder that keeps everything (paper_fig_corners or paper_fig_full)")
+    parser.add_argument("--readme", action="store_true", help="put the table into the README")
     parser.add_argument("--workers", type=int, default=2, help="processes for simulation and detection")
     arguments = parser.parse_args()
     out = arguments.out or Path("paper_fig_corners" if arguments.corners else "paper_fig_full")
@@ -54,13 +58,16 @@ def main() -> int:
     for number in tqdm(range(arguments.recordings), unit="recording", disable=not sys.stderr.isatty()):
         folders.append(out / f"recording{number:02d}")
         if not (folders[-1] / "calibration.npz").is_file():
-            rig, turns = changed_rig(number, arguments.duration)
+            rig, changes = changed_rig(number, arguments.duration)
             found = from_corners(rig) if arguments.corners else from_recording(rig, folders[-1], arguments.workers)
-            turned_back(found, turns).save(folders[-1])
+            changed_back(found, changes).save(folders[-1])
     result = study_of(folders, out)
     write_figure(result, out / "repeatability.png")
     print(summary_text(result))
-    print(translation_table(result))
+    table = translation_table(result)
+    print(table)
+    if arguments.readme:
+        into_readme("paper_fig_repeatability", table)
     print(f"figure: {(out / 'repeatability.png').resolve()}")
     return 0
 
@@ -68,12 +75,21 @@ def main() -> int:
 # --- the recordings --------------------------------------------------------------------------------------------------
 
 
-def changed_rig(number: int, duration_s: float) -> tuple[SimulatedRig, list[np.ndarray]]:
-    """The rig of one recording, and by which rotation (3, 3) each camera has turned about its centre."""
+@dataclass(frozen=True)
+class Change:
+    """What became of a camera: the rotation (3, 3) by which it has turned about its centre, and by how much the
+    parameters (P,) of its lens have grown."""
+
+    turn: np.ndarray
+    lens: np.ndarray
+
+
+def changed_rig(number: int, duration_s: float) -> tuple[SimulatedRig, list[Change]]:
+    """The rig of one recording, and how each of its cameras differs from the drawing's."""
     rig = paper_rig(duration_s=duration_s, seed=100 + number)
     rng = np.random.default_rng([number, 2021])
     cameras: list[SimulatedCamera] = []
-    turns: list[np.ndarray] = []
+    changes: list[Change] = []
     for camera in rig.cameras:
         turn = np.eye(4)
         turn[:3, :3] = Rotation.from_rotvec(np.radians(TURN_DEG) * rng.standard_normal(3)).as_matrix()
@@ -83,8 +99,8 @@ def changed_rig(number: int, duration_s: float) -> tuple[SimulatedRig, list[np.n
         lens[4:] *= 1.0 + 2.0 * LENS_SHARE * rng.standard_normal(len(lens) - 4)
         model = camera.model.with_parameters(lens)
         cameras.append(dataclasses.replace(camera, model=model, T_cam_imu=turn @ camera.T_cam_imu))
-        turns.append(turn[:3, :3])
-    return dataclasses.replace(rig, cameras=tuple(cameras)), turns
+        changes.append(Change(turn[:3, :3], lens - np.array(camera.model.parameters)))
+    return dataclasses.replace(rig, cameras=tuple(cameras)), changes
 
 
 def from_corners(rig: SimulatedRig) -> Calibration:
@@ -104,11 +120,11 @@ def from_recording(rig: SimulatedRig, folder: Path, workers: int) -> Calibration
         return run_pipeline(path, folder / "pipeline", settings=settings, workers=workers, progress=bars)
 
 
-def turned_back(calibration: Calibration, turns: list[np.ndarray]) -> Calibration:
-    """The calibration with every camera's frame turned back to where the drawing has it."""
+def changed_back(calibration: Calibration, changes: list[Change]) -> Calibration:
+    """The calibration with every camera's frame turned back to the drawing's, and its lens moved back."""
     covariance = calibration.covariance.copy()
     start = 0
-    back = {f"{camera.name}.{part}": turn.T for camera, turn in zip(calibration.cameras, turns, strict=True)
+    back = {f"{camera.name}.{part}": change.turn.T for camera, change in zip(calibration.cameras, changes, strict=True)
             for part in ("T_cn_cnm1", "T_cam_imu")}  # fmt: skip
     for name, size in calibration.blocks:
         if name in back:
@@ -117,13 +133,14 @@ def turned_back(calibration: Calibration, turns: list[np.ndarray]) -> Calibratio
             covariance[rows] = rotation @ covariance[rows]
             covariance[:, rows] = covariance[:, rows] @ rotation.T
         start += size
-    matrices = [_matrix(turn.T) for turn in turns]
+    matrices = [_matrix(change.turn.T) for change in changes]
     cameras = []
     for c, camera in enumerate(calibration.cameras):
         relative, to_imu = camera.T_cn_cnm1, camera.T_cam_imu
         cameras.append(
             dataclasses.replace(
                 camera,
+                model=camera.model.with_parameters(np.array(camera.model.parameters) - changes[c].lens),
                 T_cn_cnm1=None if relative is None else matrices[c] @ relative @ matrices[c - 1].T,
                 T_cam_imu=None if to_imu is None else matrices[c] @ to_imu,
             )
@@ -141,13 +158,14 @@ def _matrix(rotation: np.ndarray) -> np.ndarray:
 
 
 def study_of(folders: list[Path], out: Path) -> StudyResult:
-    """The recordings against the drawing; only the poses among the cameras are of it."""
+    """The recordings against the drawing."""
     first = load_calibration(folders[0])
-    places = [camera.T_cam_imu for camera in paper_rig().cameras]
+    drawn = paper_rig().cameras
+    places = [camera.T_cam_imu for camera in drawn]
     relative = [None, *(b @ np.linalg.inv(a) for a, b in itertools.pairwise(places))]
     cameras = tuple(
-        dataclasses.replace(camera, T_cn_cnm1=pose, T_cam_imu=place)
-        for camera, pose, place in zip(first.cameras, relative, places, strict=True)
+        dataclasses.replace(camera, model=own.model, T_cn_cnm1=pose, T_cam_imu=own.T_cam_imu)
+        for camera, pose, own in zip(first.cameras, relative, drawn, strict=True)
     )
     drawing = out / "cad" / "camchain.yaml"
     write_calibration(dataclasses.replace(first, cameras=cameras), drawing.parent, "kalibr")
