@@ -1,9 +1,9 @@
 """jaxcal: calibrate event cameras, frame cameras and IMUs jointly. Every public name is reachable from here."""
 
-import importlib
 import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
+from jaxcal.imports import attribute_of
 from jaxcal.jax_settings import configure_jax
 
 configure_jax()
@@ -60,7 +60,7 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         return importlib.metadata.version("jaxcal")
     if name in _EXPORTS:
-        value = getattr(importlib.import_module(_EXPORTS[name]), name)
+        value = attribute_of(_EXPORTS[name], name)
         globals()[name] = value
         return value
     raise AttributeError(f"module 'jaxcal' has no attribute '{name}'")

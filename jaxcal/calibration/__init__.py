@@ -1,17 +1,33 @@
 """The two jobs: calibrate cameras, and cameras with an IMU."""
 
-from jaxcal.calibration.camera_imu import calibrate_camera_imu
-from jaxcal.calibration.cameras import calibrate_cameras
-from jaxcal.calibration.cross_validate import cross_validate
-from jaxcal.calibration.held_back import held_back_residuals
-from jaxcal.calibration.resolve import resolve
-from jaxcal.calibration.spline_setup import frame_rate_for_spline
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "calibrate_camera_imu",
-    "calibrate_cameras",
-    "cross_validate",
-    "frame_rate_for_spline",
-    "held_back_residuals",
-    "resolve",
-]
+from jaxcal.imports import attribute_of
+
+# name -> module that defines it; imported when first asked for: cameras alone need no IMU.
+_EXPORTS = {
+    "calibrate_camera_imu": "jaxcal.calibration.camera_imu",
+    "calibrate_cameras": "jaxcal.calibration.cameras",
+    "cross_validate": "jaxcal.calibration.cross_validate",
+    "frame_rate_for_spline": "jaxcal.calibration.spline_setup",
+    "held_back_residuals": "jaxcal.calibration.held_back",
+    "resolve": "jaxcal.calibration.resolve",
+}
+
+__all__ = [*sorted(_EXPORTS)]  # pyright: ignore[reportUnsupportedDunderAll]
+
+if TYPE_CHECKING:
+    from jaxcal.calibration.camera_imu import calibrate_camera_imu
+    from jaxcal.calibration.cameras import calibrate_cameras
+    from jaxcal.calibration.cross_validate import cross_validate
+    from jaxcal.calibration.held_back import held_back_residuals
+    from jaxcal.calibration.resolve import resolve
+    from jaxcal.calibration.spline_setup import frame_rate_for_spline
+
+
+def __getattr__(name: str) -> Any:
+    if name in _EXPORTS:
+        value = attribute_of(_EXPORTS[name], name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'jaxcal.calibration' has no attribute '{name}'")

@@ -21,7 +21,6 @@ from jaxcal.calibration.robust import robust_fit
 from jaxcal.calibration.rolling import shutters_of
 from jaxcal.calibration.state import RigState, SharedLayout, layout_of
 from jaxcal.calibration.uncertainty import stamp_sigmas_of, with_common_delay
-from jaxcal.calibration.unsynchronised import continuous_problem
 from jaxcal.calibration.views import BoardFrames, associate, split_boards
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
@@ -196,6 +195,8 @@ def _first_look(
 
 
 def _continuous(names: Sequence[str], look: _Look, target: Target, shape: _Shape) -> _Joint:
+    from jaxcal.calibration.unsynchronised import continuous_problem  # brings scipy.interpolate: 0.1 s, seldom needed
+
     start = continuous_problem(
         names,
         look.lenses,

@@ -251,9 +251,9 @@ def _linearise(
     huber = np.minimum(1.0, width / np.maximum(length, 1e-12))
     rho = np.where(length <= width, length**2, 2.0 * width * length - width**2)
     cost = 0.5 * np.sum(rho * views.weight, axis=-1)
-    rows = rows * np.sqrt(np.where(inside, huber, 0.0) * views.weight)[..., None, None, :]
+    rows *= np.sqrt(np.where(inside, huber, 0.0) * views.weight)[..., None, None, :]
     if not inside.all():
-        rows = np.where(inside[..., None, None, :], rows, 0.0)
+        np.copyto(rows, 0.0, where=~inside[..., None, None, :])
     flat = rows.reshape(*rows.shape[:-2], -1)
     return flat @ flat.swapaxes(-1, -2), cost
 

@@ -1,5 +1,7 @@
 """Poses of a flat board through a lens that is given, the better of the two that such a board allows."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from jaxcal.calibration import generic_lens
@@ -9,6 +11,7 @@ from jaxcal.calibration.generic_lens import GenericLens
 from jaxcal.calibration.initial_poses import mirrored_poses, planar_poses
 from jaxcal.calibration.model_lens import ModelLens
 from jaxcal.cameras import CameraModel
+from jaxcal.child import usable_cores
 from jaxcal.estimation.threads import single_threaded_blas
 from jaxcal.targets import Target
 
@@ -30,17 +33,21 @@ def board_poses(model: CameraModel, frames: CameraFrames, target: Target) -> tup
     lens = ModelLens(model)
     parameters = np.asarray(model.parameters)[None]
     far = float(max(frames.detections.image_size))
-    parts = []
+    chunk = max(_POSE_CORNERS // len(target.points), 1)
+
+    def posed(first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        part = slice(first, first + chunk)
+        views = compact_views(target.points, frames.pixels[part], frames.seen[part])
+        fit = poses_from_rays(lens, parameters, *generic_lens.unproject(generic, views.pixels), views, far)
+        squared = squared_errors(lens, fit, views, far=1e6)[0]
+        error = np.sqrt(np.sum(squared * views.weight, axis=1) / views.weight.sum(axis=1))
+        return fit.rotation[0], views.to_target(fit.rotation[0], fit.translation[0]), error
+
     with single_threaded_blas():
         generic = generic_of(model, frames.detections.image_size)
-        chunk = max(_POSE_CORNERS // len(target.points), 1)
-        for first in range(0, len(frames.frames), chunk):
-            part = slice(first, first + chunk)
-            views = compact_views(target.points, frames.pixels[part], frames.seen[part])
-            fit = poses_from_rays(lens, parameters, *generic_lens.unproject(generic, views.pixels), views, far)
-            squared = squared_errors(lens, fit, views, far=1e6)[0]
-            error = np.sqrt(np.sum(squared * views.weight, axis=1) / views.weight.sum(axis=1))
-            parts.append((fit.rotation[0], views.to_target(fit.rotation[0], fit.translation[0]), error))
+        # Numpy and jax let go of the interpreter while they compute.
+        with ThreadPoolExecutor(max_workers=usable_cores()) as threads:
+            parts = list(threads.map(posed, range(0, len(frames.frames), chunk)))
     rotation, translation, error = (np.concatenate(values) for values in zip(*parts, strict=True))
     return rotation, translation, error
 

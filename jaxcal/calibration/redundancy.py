@@ -15,7 +15,7 @@ from jaxcal.calibration.assemble import CameraFrames
 
 # Views closer than this look alike (see `view_features`: 0.12 is 77 px of shift in a 640 px image).
 _ALIKE = 0.12
-_PAIRS = 4000
+_PAIRS, _TRIED_PAIRS = 4000, 240_000
 _MOST_VIEWS = 3000
 # Correlations below this are taken for noise: independent corners in some thousand pairs stay well under it.
 _NEGLIGIBLE = 0.08
@@ -91,7 +91,10 @@ def _shared_out(features: np.ndarray, worth: np.ndarray) -> tuple[np.ndarray, fl
 def _correlation_of_look_alikes(features: np.ndarray, errors: np.ndarray, usable: np.ndarray) -> float:
     """Correlation of the residuals of equal corners over pairs of views that look alike."""
     rng = np.random.default_rng(0)
-    first, second = rng.integers(0, len(errors), size=(2, 60 * _PAIRS))
+    if len(errors) * (len(errors) - 1) // 2 <= _TRIED_PAIRS:
+        first, second = rng.permutation(np.column_stack(np.triu_indices(len(errors), 2))).T
+    else:
+        first, second = rng.integers(0, len(errors), size=(2, _TRIED_PAIRS))
     after = np.arange(len(errors) - 1)  # neighbours in time are often the most alike
     first, second = np.concatenate([after, first]), np.concatenate([after + 1, second])
     distance = np.linalg.norm(features[first] - features[second], axis=1)

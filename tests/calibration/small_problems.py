@@ -41,7 +41,9 @@ def random_frames(rng: np.random.Generator, count: int, missing: float) -> list[
     """`count` frames per camera with corners anywhere in the image; the residuals need not be small."""
     cameras = []
     for c in range(CAMERAS):
-        frame, point = np.nonzero(rng.random((count, len(BOARD.points))) >= missing)
+        seen = rng.random((count, len(BOARD.points))) >= missing
+        seen[:, :4] |= seen.sum(axis=1, keepdims=True) < 4  # or the frame would be none
+        frame, point = np.nonzero(seen)
         pixels = rng.uniform(100.0, 380.0, (len(frame), 2))
         detections = Detections(1000 * np.arange(count), frame, point, pixels, SIZE)
         cameras.append(camera_frames(detections, BOARD, f"cam{c}", min_corners=4))
