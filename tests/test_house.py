@@ -14,13 +14,14 @@ import jaxcal
 ROOT = Path(jaxcal.__file__).parents[1]
 
 # What each room may import of ours; data moves one way. A room is a module or package directly below `jaxcal`.
-EVERYWHERE = {"jaxcal.errors", "jaxcal.progress", "jaxcal.atomic", "jaxcal.programs"}
+EVERYWHERE = {"jaxcal.errors", "jaxcal.progress", "jaxcal.atomic", "jaxcal.imports", "jaxcal.programs"}
 OBSERVATIONS = {"jaxcal.observations"}
 ALLOWED: dict[str, set[str]] = {
     "jaxcal.errors": set(),
     "jaxcal.progress": set(),
     "jaxcal.atomic": set(),
     "jaxcal.child": set(),
+    "jaxcal.imports": set(),
     "jaxcal.programs": {"jaxcal.atomic"},
     "jaxcal.jax_settings": set(),
     "jaxcal.observations": set(),
@@ -35,6 +36,7 @@ ALLOWED: dict[str, set[str]] = {
     "jaxcal.results": {"jaxcal.cameras", "jaxcal.child", "jaxcal.targets"} | OBSERVATIONS,
     "jaxcal.calibration": {
         "jaxcal.cameras",
+        "jaxcal.child",
         "jaxcal.trajectory",
         "jaxcal.imu",
         "jaxcal.targets",

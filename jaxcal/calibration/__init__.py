@@ -4,24 +4,32 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcal.imports import attribute_of
 
-# name -> module that defines it; imported when first asked for: cameras alone need no IMU.
+# name -> module that defines it; imported when first asked for: cameras alone need no IMU. No module is called as one
+# of these names is: importing it would put it in the place of what is meant.
 _EXPORTS = {
     "calibrate_camera_imu": "jaxcal.calibration.camera_imu",
     "calibrate_cameras": "jaxcal.calibration.cameras",
-    "cross_validate": "jaxcal.calibration.cross_validate",
+    "cross_validate": "jaxcal.calibration.cross_validation",
     "frame_rate_for_spline": "jaxcal.calibration.spline_setup",
     "held_back_residuals": "jaxcal.calibration.held_back",
-    "resolve": "jaxcal.calibration.resolve",
+    "resolve": "jaxcal.calibration.resolving",
 }
 
-__all__ = [*sorted(_EXPORTS)]  # pyright: ignore[reportUnsupportedDunderAll]
+__all__ = [
+    "calibrate_camera_imu",
+    "calibrate_cameras",
+    "cross_validate",
+    "frame_rate_for_spline",
+    "held_back_residuals",
+    "resolve",
+]
 
 if TYPE_CHECKING:
     from jaxcal.calibration.camera_imu import calibrate_camera_imu
     from jaxcal.calibration.cameras import calibrate_cameras
-    from jaxcal.calibration.cross_validate import cross_validate
+    from jaxcal.calibration.cross_validation import cross_validate
     from jaxcal.calibration.held_back import held_back_residuals
-    from jaxcal.calibration.resolve import resolve
+    from jaxcal.calibration.resolving import resolve
     from jaxcal.calibration.spline_setup import frame_rate_for_spline
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from jaxcal.calibration.resolve import settings_of
+from jaxcal.calibration.resolving import settings_of
 from jaxcal.cameras import camera_model
 from jaxcal.errors import CalibrationError
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal.calibration import calibrate_cameras
-from jaxcal.calibration.resolve import check_changes, recordings_of, resolve
+from jaxcal.calibration.resolving import check_changes, recordings_of, resolve
 from jaxcal.errors import CalibrationError
 from jaxcal.observations import Detections
 from jaxcal.results import Calibration, load_calibration

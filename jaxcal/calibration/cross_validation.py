@@ -11,7 +11,7 @@ from jaxcal.calibration.known import KnownProblem, known_problem, rank_of
 from jaxcal.calibration.lens_basis import to_parameters
 from jaxcal.calibration.model_errors import find_model_errors, with_lag
 from jaxcal.calibration.problem import camera_poses
-from jaxcal.calibration.resolve import recordings_of, resolve
+from jaxcal.calibration.resolving import recordings_of, resolve
 from jaxcal.calibration.state import RigState, camera_model_of
 from jaxcal.calibration.uncertainty import labels_of, named_covariance, shared_covariance
 from jaxcal.errors import CalibrationError
