@@ -12,6 +12,7 @@ from jaxcal.calibration.assemble import CameraFrames, split_groups, stack_weight
 from jaxcal.calibration.checks import versions
 from jaxcal.calibration.lens_basis import to_parameters
 from jaxcal.calibration.problem import camera_poses
+from jaxcal.calibration.redundancy import Redundancy
 from jaxcal.calibration.robust import RobustFit
 from jaxcal.calibration.rolling import check_readout
 from jaxcal.calibration.score_noise import ScoreNoise, score_noise
@@ -23,6 +24,10 @@ from jaxcal.errors import CalibrationError
 from jaxcal.estimation import BlockArrow, on_device, solve
 from jaxcal.results import Calibration, CameraCalibration, ImuCalibration, TargetShape
 from jaxcal.targets import Target
+
+# Corners of any video, and of frames made of events, hang together somewhat, and sigmas allow for it. Where they are
+# more than three times as large for it, something is amiss.
+_WORTH_SAYING = 9.0
 
 
 def chain_covariance_and_sentences(
@@ -55,21 +60,30 @@ def chain_covariance_and_sentences(
         if noise is not None:
             by_score = response[:, layout.lens(c)]
             covariance = covariance + by_score @ noise.beyond(effect) @ by_score.T
-    for name, redundancy, effect in zip(names, fit.redundancy, effects, strict=True):
-        if effect == 1.0:
-            continue
+    sentences += sentences_on_errors(names, fit.redundancy, effects)
+    return covariance, chain, sentences
+
+
+def sentences_on_errors(
+    names: Sequence[str], redundancies: Sequence[Redundancy], effects: Sequence[float]
+) -> list[str]:
+    """Sentences about cameras whose errors are no independent noise: `effects` (C,), factors of their variance."""
+    sentences = []
+    for name, redundancy, effect in zip(names, redundancies, effects, strict=True):
         if redundancy.inflation > 1.0:
             what = (
                 f"the errors of views that look alike agree (correlation {redundancy.correlation:.2f}), so they are no "
                 "noise: the lens model is too lean, the board not flat, or the detector biased. Such views count less"
             )
-        else:
+        elif effect > _WORTH_SAYING:
             what = "the errors of corners hang together, within a view or from one view to the next"
+        else:
+            continue
         sentences.append(
             f"{name}: {what}, and sigmas of this camera are {np.sqrt(effect):.1f} times what independent errors of the "
             "same size would make them."
         )
-    return covariance, chain, sentences
+    return sentences
 
 
 def _score_noises(fit: RobustFit, cameras: Sequence[CameraFrames]) -> list[ScoreNoise | None]:
