@@ -51,17 +51,28 @@ def chain_covariance_and_sentences(
         max(1.0 if noise is None else noise.effect, known.inflation)
         for noise, known in zip(noises, fit.redundancy, strict=True)
     ]
-    covariance, chain, sentences = uncertainty.shared_covariance(fit.result.equations, *known_as)
-    response = covariance
-    if max(effects) > 1.0 or any((effect != 1.0).any() for effect in imu_effects):
-        less = _equations_of_less(fit, cameras, effects, imu_effects)
-        covariance, chain, sentences = uncertainty.shared_covariance(less, *known_as)
+    as_weighted = max(effects) == 1.0 and all((effect == 1.0).all() for effect in imu_effects)
+    equations = fit.result.equations if as_weighted else _equations_of_less(fit, cameras, effects, imu_effects)
+    covariance, chain, sentences = uncertainty.shared_covariance(equations, *known_as)
+    if any(noise is not None for noise in noises):
+        # How the optimum answers to a score is a matter of the weights that it was found with.
+        response = covariance if as_weighted else uncertainty.shared_covariance(fit.result.equations, *known_as)[0]
+        covariance = covariance + _beyond_the_mean(response, layout, noises, effects)
+    sentences += sentences_on_errors(names, fit.redundancy, effects)
+    return covariance, chain, sentences
+
+
+def _beyond_the_mean(
+    response: np.ndarray, layout: SharedLayout, noises: Sequence[ScoreNoise | None], effects: Sequence[float]
+) -> np.ndarray:
+    """Covariance (P, P) from the directions of each lens whose score scatters by more than the camera's `effects`;
+    `response` (P, P) is how the shared parameters answer to scores."""
+    total = np.zeros_like(response)
     for c, (noise, effect) in enumerate(zip(noises, effects, strict=True)):
         if noise is not None:
             by_score = response[:, layout.lens(c)]
-            covariance = covariance + by_score @ noise.beyond(effect) @ by_score.T
-    sentences += sentences_on_errors(names, fit.redundancy, effects)
-    return covariance, chain, sentences
+            total += by_score @ noise.beyond(effect) @ by_score.T
+    return total
 
 
 def sentences_on_errors(

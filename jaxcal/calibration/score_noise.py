@@ -6,9 +6,9 @@ its score, the gradient of the cost by its parameters: over all views, scores of
 information matrix says. Whether they scatter more is tested view by view and over neighbours in time (the "sandwich" of
 White 1980 with the weights over lags of Newey and West 1987, "A simple, positive semi-definite, heteroskedasticity and
 autocorrelation consistent covariance matrix", eq. 5). Where they do, by how much, and in which directions, is what the
-lens does when one stretch of the recording after another is left out (the delete-a-group jackknife, Shao and Tu 1995,
-"The jackknife and bootstrap", eq. 2.18): unlike the sandwich it sees errors that last as long as a stretch, and allows
-for the share of its own errors that the lens has followed.
+lens does when one stretch of the recording after another is left out (Kott 2001, "The delete-a-group jackknife"):
+unlike the sandwich it sees errors that last as long as a stretch, and allows for the share of its own errors that the
+lens has followed.
 """
 
 from dataclasses import dataclass
