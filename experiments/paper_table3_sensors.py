@@ -5,7 +5,8 @@
 
 The paper used recordings of real sensors; here they are simulated, with the resolution, a lens and the noise of each.
 For every way of making frames: the boards found over those in ideal frames, and the reprojection error of a calibration
-from them (root mean square length, px). E2VID's weights are not at hand: its column is the paper's own.
+from them (root mean square length, px). E2VID's weights are not at hand: its column is the paper's own; the network
+trained in its way is FireNet, on pictures of no board (models/firenet_pictures.md).
 """
 
 import sys
@@ -74,6 +75,7 @@ SENSORS = {
     ),
 }  # fmt: skip
 BOARD = Checkerboard(rows=6, cols=9, spacing=0.1)
+NETWORKS: dict[str, str | None] = {"ours": None, "FireNet, general training": "firenet_pictures"}  # None: `--network`
 METHODS: dict[str, Callable] = {"leaky integration": leaky_integration, "event count": event_count}
 
 
@@ -102,7 +104,8 @@ def sensor_figures(options: Any, name: str, progress: Progress) -> dict[str, Any
             sensor=sensor.noise, psf_sigma_px=sensor.psf_sigma_px,
         )  # fmt: skip
         frames: dict[str, Frames] = {"ideal": recording.ideal_frames()}
-        frames["network"] = network_frames(recording, options.network, progress)
+        for method, network in NETWORKS.items():
+            frames[method] = network_frames(recording, network or options.network, progress)
         for method, maker in METHODS.items():
             frames[method] = made_frames(recording, method.replace(" ", "_"), "1", maker, progress)
         for method, images in frames.items():
@@ -136,11 +139,10 @@ def reprojection_rms_px(recording: Recording, detections: Detections) -> float:
 
 def table(numbers: list[dict[str, Any]]) -> str:
     """Boards found and reprojection errors as markdown, a row per sensor."""
-    methods = ("network", *METHODS, "ideal")
+    methods = (*NETWORKS, *METHODS, "ideal")
     header = ["sensor", "paper, E2VID: rms (px)"]
     for method in methods:
-        name = "ours" if method == "network" else method
-        header += [f"{name}: found", "rms (px)"]
+        header += [f"{method}: found", "rms (px)"]
     rows = []
     for row in numbers:
         cells = [row["sensor"], f"{SENSORS[row['sensor']].paper_rms_px:.2f}"]

@@ -8,6 +8,7 @@ An interrupted run goes on where it stopped.
 
 import argparse
 import logging
+import os
 from pathlib import Path
 
 import cv2
@@ -17,8 +18,9 @@ from tqdm import tqdm
 from jaxcal.progress import Progress
 from reconstruction.checkpoints import DEFAULT_NETWORK, load_network, save_network
 from reconstruction.networks import ReconstructionNetwork
+from reconstruction.reconstructor import find_device
 from reconstruction.training.data import load_or_generate
-from reconstruction.training.loop import Run, train
+from reconstruction.training.loop import Run, finished, train
 from reconstruction.training.recipe import RECIPES, Recipe
 
 
@@ -55,31 +57,49 @@ def main() -> None:
         default=1,
         help="CPU threads (default: %(default)s; the layers are small, and more of them change the rounding)",
     )
+    parser.add_argument("--device", default="auto", help="'cpu', 'cuda', 'auto': a GPU if there is one (%(default)s)")
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, help="processes that simulate sequences (%(default)s)"
+    )
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(arguments.threads)
     cache = arguments.cache or arguments.output / ".cache"
     recipe, bars = RECIPES[arguments.name], _Bars()
-    run = trained(arguments.name, recipe, cache, arguments.parent, bars)
+    device = find_device(arguments.device)
+    run = trained(arguments.name, recipe, cache, arguments.parent, bars, device=device, workers=arguments.workers)
     from reconstruction.training.export import evaluate_and_export
 
     evaluate_and_export(run, recipe, arguments.output / f"{arguments.name}.safetensors", progress=bars)
 
 
-def trained(name: str, recipe: Recipe, cache: Path, parent: Path | None, progress: Progress) -> Run:
+def trained(
+    name: str,
+    recipe: Recipe,
+    cache: Path,
+    parent: Path | None,
+    progress: Progress,
+    *,
+    device: torch.device,
+    workers: int,
+) -> Run:
     """The training of a recipe, after its parent's unless the parent's weights are given."""
+    checkpoint = cache / f"{name}.checkpoint.pt"
+    run = finished(recipe, checkpoint)
+    if run is not None:
+        return run
     start: ReconstructionNetwork | None = None
-    if parent is not None:
-        start = load_network(parent)
-    elif recipe.parent is not None:
+    if parent is None and recipe.parent is not None:
         # Through a file, as it is shipped: the weights in it are rounded.
         parent = cache / f"{name}.parent.safetensors"
         if not parent.exists():
-            save_network(trained(f"{name}.parent", recipe.parent, cache, None, progress).average, parent)
+            before = trained(f"{name}.parent", recipe.parent, cache, None, progress, device=device, workers=workers)
+            save_network(before.average, parent)
+    if parent is not None:
         start = load_network(parent)
-    dataset = load_or_generate(recipe.data, recipe.num_bins, cache, progress)
-    return train(recipe, dataset, cache / f"{name}.checkpoint.pt", parent=start, progress=progress)
+    dataset = load_or_generate(recipe.data, recipe.num_bins, cache, progress, workers)
+    return train(recipe, dataset, checkpoint, parent=start, device=device, progress=progress)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from reconstruction.checkpoints import load_network, save_network
 from reconstruction.networks import ReconstructionNetwork
 from reconstruction.training.evaluate import CornerErrors, Evaluation, evaluate
 from reconstruction.training.loop import HISTORY_STEPS, Run
-from reconstruction.training.recipe import Recipe, fingerprint
+from reconstruction.training.recipe import DataRecipe, Recipe, fingerprint
 
 LICENCE = "Apache-2.0"
 _SPEED_BINS = (0.0, 1.0, 3.0, 6.0, 10.0, 15.0, 25.0)  # pixels per window
@@ -26,7 +26,7 @@ def evaluate_and_export(run: Run, recipe: Recipe, path: Path, progress: Progress
         name=path.stem,
         licence=LICENCE,
         recipe=recipe.describe(),
-        data="simulated calibration boards; no recordings",
+        data=f"simulated {_subject(recipe)}; no recordings",
     )
     evaluation = evaluate(load_network(path), progress=progress)
     _draw_curves(run, evaluation, path.with_suffix(".svg"))
@@ -49,7 +49,7 @@ def model_card(path: Path, run: Run, recipe: Recipe, evaluation: Evaluation) -> 
     )
     return f"""# {path.stem}
 
-Reconstructs grey images of calibration boards from events. `reconstruction.load_network("{path.stem}")`.
+Reconstructs grey images of {_subject(recipe)} from events. `reconstruction.load_network("{path.stem}")`.
 
 | | |
 |---|---|
@@ -58,25 +58,24 @@ Reconstructs grey images of calibration boards from events. `reconstruction.load
 | licence | {LICENCE} |
 | architecture | {type(network).__name__}, {parameters} parameters: {_settings(network)} |
 | input | {_input(recipe)}, any sensor size |
-| output | linear intensity {_moment(network)}; the board's black is at 0.05, its white at 0.95 |
+| output | linear intensity {_moment(network)}; black is at 0.05, white at 0.95 |
 
-It knows calibration boards before cluttered backgrounds, and nothing else: it is not for pictures of the world.
+{_scope(recipe)}
 
 ## Data
 
 {data.sequences} simulated sequences of {data.windows} windows on {data.size}x{data.size} pixels,
-{100 * data.checkerboards:.0f} % checkerboards, {100 * data.others:.0f} % circle grids and ChArUco boards, the rest
-AprilGrids with bits of {data.smallest_bit_px:g} to 7 pixels, in perspective, at tilts of up to
-{data.largest_tilt_deg:g} degrees, with white margins, uneven light and random backgrounds. Image motion of 0.4 to 25
-pixels per window, with pauses. Event sensor (ESIM model): contrast thresholds 0.1 to 0.5 (log-uniform), ON and OFF
-up to a factor 1.5 apart, 1 to 15 % mismatch from pixel to pixel, refractory time 1 us to 0.5 ms, noise 0.01 to 3 Hz,
-leak up to 0.3 Hz, some hot pixels.
+{_scenes(data)}, in perspective, at tilts of up to
+{data.largest_tilt_deg:g} degrees. Image motion of {0.25 * data.slowest_px:.2g} to {data.fastest_px:g} pixels per
+window, with pauses{_swinging(data)}. Event sensor (ESIM model): contrast thresholds 0.1 to 0.5 (log-uniform), ON and
+OFF up to a factor 1.5 apart, 1 to 15 % mismatch from pixel to pixel, refractory time 1 us to 0.5 ms, noise 0.01 to
+3 Hz, leak up to 0.3 Hz, some hot pixels.
 No recordings, no third-party images.
 
 ## Recipe
 
 `python -m reconstruction.training --output models/ --name {path.stem}`, {run.seconds / 60:.0f} minutes of training on
-two CPU cores{_after_parent(recipe)}.
+{run.machine or "two CPU cores"}{_after_parent(recipe)}.
 Loss: {_loss(recipe)}.
 AdamW {recipe.learning_rate:g}, falling to zero over the last {100 * recipe.falling_share:.0f} % of the steps, gradient
 norm clipped at {recipe.clip_norm}, weights averaged (decay {recipe.average_decay}); {recipe.precision}.
@@ -105,6 +104,34 @@ Detection ratio {evaluation.detection_ratio:.3f}. By speed of the corner:
 
 ![loss over the steps, and corner error over the speed]({path.stem}.svg)
 """
+
+
+def _subject(recipe: Recipe) -> str:
+    return "the world at large" if recipe.data.pictures == 1.0 else "calibration boards"
+
+
+def _scope(recipe: Recipe) -> str:
+    if recipe.data.pictures == 1.0:
+        return (
+            "It has never seen a calibration board: it is here for comparison, as a network trained in the usual way."
+        )
+    return (
+        "It knows calibration boards on cluttered backgrounds, and nothing else: it is not for pictures of the world."
+    )
+
+
+def _scenes(data: DataRecipe) -> str:
+    if data.pictures == 1.0:
+        return "pictures of shapes that cover each other (dead leaves: Lee, Mumford, Huang 2001)"
+    return (
+        f"{100 * data.checkerboards:.0f} % checkerboards, {100 * data.others:.0f} % circle grids and ChArUco boards, "
+        f"the rest AprilGrids\nwith bits of {data.smallest_bit_px:g} to 7 pixels, with white margins, uneven light and "
+        "random backgrounds"
+    )
+
+
+def _swinging(data: DataRecipe) -> str:
+    return f", {100 * data.swinging:.0f} % of them slower where the motion turns back" if data.swinging else ""
 
 
 def _moment(network: ReconstructionNetwork) -> str:

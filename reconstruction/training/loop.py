@@ -4,9 +4,11 @@ import copy
 import logging
 import os
 import time
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +23,13 @@ from reconstruction.training.losses import displacement_loss, image_loss
 from reconstruction.training.recipe import Recipe, Stage, fingerprint
 
 HISTORY_STEPS = 50
+_COUNTERS = ("step", "stage", "clip", "seconds", "machine", "loss", "history")
+
+# One segment of a clip, its gradients left in the network: voxels, targets, the state before it (None at a clip's
+# start) and how many windows do not count, to the loss and the state after it.
+Voxels = Float[torch.Tensor, "t b c h w"]
+Targets = Float[torch.Tensor, "t b 1 h w"]
+Segment = Callable[[Voxels, Targets, State | None, int], tuple[Float[torch.Tensor, ""], State]]
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +45,7 @@ class Run:
     stage: int = 0
     clip: int = 0
     seconds: float = 0.0
+    machine: str = ""  # what it was trained on
     loss: float = float("nan")  # smoothed over some 50 steps
     history: list[float] = field(default_factory=list)  # `loss` after every HISTORY_STEPS steps
 
@@ -46,6 +56,7 @@ def train(
     checkpoint: Path,
     *,
     parent: ReconstructionNetwork | None = None,
+    device: torch.device | str = "cpu",
     checkpoint_every_s: float = 120.0,
     progress: Progress = no_progress,
 ) -> Run:
@@ -53,16 +64,20 @@ def train(
 
     Starts with the weights of `parent`, or at random. Continues from `checkpoint` if one of the same recipe
     is there. Which clip comes when depends on the recipe's seed and the clip's number only, so that an interrupted run
-    ends as an uninterrupted one does.
+    ends as an uninterrupted one does. On a GPU the steps are replayed as CUDA graphs; rounding differs from a CPU's.
     """
-    run = _start(recipe, parent)
+    device = torch.device(device)
+    run = _start(recipe, parent, device)
     _resume(run, recipe, checkpoint)
+    run.machine = run.machine or _name(device)
+    dataset = dataset.near(device)
+    segment = _Replayed(run.network, recipe) if device.type == "cuda" else _eager(run.network, recipe)
     saved = begun = time.monotonic()
     before = run.seconds
     while run.stage < len(recipe.stages):
         stage = recipe.stages[run.stage]
         while run.clip < stage.clips:
-            _train_on_clip(run, recipe, stage, dataset)
+            _train_on_clip(run, recipe, stage, dataset, segment)
             run.clip += 1
             run.seconds = before + time.monotonic() - begun
             progress("train", run.step, recipe.steps)
@@ -72,15 +87,31 @@ def train(
                 logger.info("step %d of %d: loss %.4f, %.0f s", run.step, recipe.steps, run.loss, run.seconds)
         run.stage, run.clip = run.stage + 1, 0
     _save(run, recipe, checkpoint)
-    run.average.eval()
+    run.average.cpu().eval()
     return run
 
 
-def _start(recipe: Recipe, parent: ReconstructionNetwork | None = None) -> Run:
+def finished(recipe: Recipe, checkpoint: Path) -> Run | None:
+    """The run that has ended in `checkpoint`, as `train` gave it; None if none of this recipe has."""
+    run = _start(recipe)
+    _resume(run, recipe, checkpoint)
+    run.average.eval()
+    return run if run.stage == len(recipe.stages) else None
+
+
+def _name(device: torch.device) -> str:
+    if device.type == "cuda":
+        return f"one {torch.cuda.get_device_name(device)}"
+    return f"{torch.get_num_threads()} CPU thread{'s' if torch.get_num_threads() > 1 else ''}"
+
+
+def _start(recipe: Recipe, parent: ReconstructionNetwork | None = None, device: torch.device | str = "cpu") -> Run:
     torch.manual_seed(recipe.seed)
     network = ARCHITECTURES[recipe.architecture](
         num_bins=recipe.num_bins,
         channels=recipe.channels,
+        base_num_channels=recipe.channels,  # FireNet's name of it
+        detail=recipe.detail,
         scaling=recipe.data.scaling,
         shown_at=recipe.data.shown_at,
     )
@@ -88,6 +119,7 @@ def _start(recipe: Recipe, parent: ReconstructionNetwork | None = None) -> Run:
         network.load_state_dict(_widened(parent.state_dict(), network.state_dict()))
     if recipe.precision == "bfloat16":
         network = network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    network = network.to(device)
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay, betas=(0.9, 0.99)
     )
@@ -104,17 +136,81 @@ def _widened(weights: dict[str, torch.Tensor], fresh: dict[str, torch.Tensor]) -
     return widened
 
 
-def _train_on_clip(run: Run, recipe: Recipe, stage: Stage, dataset: Dataset) -> None:
+def _train_on_clip(run: Run, recipe: Recipe, stage: Stage, dataset: Dataset, segment: Segment) -> None:
     rng = np.random.default_rng([recipe.seed, run.stage, run.clip])
     voxels, targets = dataset.clip(rng, stage)
     state: State | None = None
-    for segment in range(stage.segments):
-        part = slice(segment * stage.windows, (segment + 1) * stage.windows)
-        loss, state = _segment_loss(
-            run.network, voxels[part], targets[part], state, stage.warm_up if segment == 0 else 0, recipe
-        )
+    for index in range(stage.segments):
+        part = slice(index * stage.windows, (index + 1) * stage.windows)
+        loss, state = segment(voxels[part], targets[part], state, stage.warm_up if index == 0 else 0)
         _optimise(run, recipe, loss)
-        state = [tensor.detach() for tensor in state]
+
+
+def _eager(network: ReconstructionNetwork, recipe: Recipe) -> Segment:
+    """Step by step, as it is written."""
+
+    def segment(voxels: Voxels, targets: Targets, state: State | None, warm_up: int):
+        network.zero_grad(set_to_none=True)
+        loss, after = _segment_loss(network, voxels, targets, state, warm_up, recipe)
+        loss.backward()
+        return loss.detach(), [tensor.detach() for tensor in after]
+
+    return segment
+
+
+class _Replayed:
+    """The same as CUDA graphs, one for each shape: a small network's thousand small kernels start without Python.
+
+    Gradients stay in one place, where every graph adds to them after setting them to zero.
+    """
+
+    def __init__(self, network: ReconstructionNetwork, recipe: Recipe):
+        self._network, self._recipe = network, recipe
+        self._graphs: dict[tuple[int, ...], tuple[torch.cuda.CUDAGraph, dict[str, Any]]] = {}
+        for parameter in network.parameters():
+            parameter.grad = torch.zeros_like(parameter)
+
+    def __call__(
+        self, voxels: Voxels, targets: Targets, state: State | None, warm_up: int
+    ) -> tuple[Float[torch.Tensor, ""], State]:
+        key = (*voxels.shape, warm_up)
+        if key not in self._graphs:
+            self._graphs[key] = self._captured(voxels, targets, warm_up)
+        graph, tensors = self._graphs[key]
+        for name, given in (("voxels", voxels), ("targets", targets)):
+            tensors[name].copy_(given)
+        for index, kept in enumerate(tensors["before"]):  # nothing remembered is zeros
+            kept.zero_() if state is None else kept.copy_(state[index])
+        graph.replay()
+        return tensors["loss"], [tensor.clone() for tensor in tensors["after"]]
+
+    def _captured(self, voxels: Voxels, targets: Targets, warm_up: int) -> tuple[torch.cuda.CUDAGraph, dict[str, Any]]:
+        tensors: dict[str, Any] = {"voxels": torch.empty_like(voxels), "targets": torch.empty_like(targets)}
+        tensors["voxels"].copy_(voxels)
+        tensors["targets"].copy_(targets)
+
+        def run() -> None:
+            # Nothing may outlive this that holds autograd's nodes: they belong to the stream on which they were made.
+            self._network.zero_grad(set_to_none=False)
+            loss, after = _segment_loss(
+                self._network, tensors["voxels"], tensors["targets"], tensors.get("before"), warm_up, self._recipe
+            )
+            loss.backward()
+            tensors["loss"], tensors["after"] = loss.detach(), [tensor.detach() for tensor in after]
+
+        with torch.backends.cudnn.flags(enabled=True, benchmark=True, allow_tf32=False):
+            # Beside the default stream, as capturing asks for; the first time tells what is remembered.
+            stream = torch.cuda.Stream()
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                for _ in range(3):
+                    run()
+                    tensors.setdefault("before", [torch.zeros_like(tensor) for tensor in tensors["after"]])
+            torch.cuda.current_stream().wait_stream(stream)
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph):
+                run()
+        return graph, tensors
 
 
 def _segment_loss(
@@ -128,7 +224,7 @@ def _segment_loss(
     """Mean loss over the windows after `warm_up`, and the state at the segment's end."""
     images = []
     reduced = recipe.precision == "bfloat16"
-    precision: AbstractContextManager = torch.autocast("cpu", torch.bfloat16) if reduced else nullcontext()
+    precision: AbstractContextManager = torch.autocast(voxels.device.type, torch.bfloat16) if reduced else nullcontext()
     layout = torch.channels_last if reduced else torch.contiguous_format
     with precision:
         for grid in voxels:
@@ -147,8 +243,6 @@ def _optimise(run: Run, recipe: Recipe, loss: Float[torch.Tensor, ""]) -> None:
     fall = min(1.0, (1.0 - run.step / recipe.steps) / recipe.falling_share)
     for group in run.optimiser.param_groups:
         group["lr"] = recipe.learning_rate * rise * fall
-    run.optimiser.zero_grad(set_to_none=True)
-    loss.backward()
     torch.nn.utils.clip_grad_norm_(run.network.parameters(), recipe.clip_norm)
     run.optimiser.step()
     # A young average follows quickly: the first weights are noise.
@@ -172,7 +266,7 @@ def _save(run: Run, recipe: Recipe, path: Path) -> None:
             "network": run.network.state_dict(),
             "average": run.average.state_dict(),
             "optimiser": run.optimiser.state_dict(),
-            "counters": {name: getattr(run, name) for name in ("step", "stage", "clip", "seconds", "loss", "history")},
+            "counters": {name: getattr(run, name) for name in _COUNTERS},
         },
         partial,
     )
@@ -182,7 +276,7 @@ def _save(run: Run, recipe: Recipe, path: Path) -> None:
 def _resume(run: Run, recipe: Recipe, path: Path) -> None:
     if not path.exists():
         return
-    saved = torch.load(path, weights_only=True)
+    saved = torch.load(path, weights_only=True, map_location="cpu")
     if saved["recipe"] != fingerprint(recipe):
         logger.info("%s belongs to another recipe: training starts anew", path)
         return

@@ -50,6 +50,13 @@ class Path:
     def homographies(self, s: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3 3"]:
         return self._at(np.interp(s, self._travelled, self._u))
 
+    def swing(self, windows: int, top_speed: float, samples: int) -> Float[np.ndarray, " n"]:
+        """Image motion so far, as `speed_profile` gives it, of a hand that swings: evenly along the waves that make
+        the path, so that it slows down where it turns back, and moves by at most `top_speed` pixels per window."""
+        steepest = (np.diff(self._travelled) / np.diff(self._u)).max()
+        u = np.linspace(0.0, windows * top_speed / steepest, windows * samples + 1)
+        return np.interp(u, self._u, self._travelled)
+
     def _at(self, u: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3 3"]:
         view = self._view
         offsets = self._scales[:, None] * np.stack([wave(u) for wave in self._waves])

@@ -89,6 +89,56 @@ def circle_grid(rng: np.random.Generator, columns: int, rows: int, cell_texels: 
     return _placed(rng, board, np.array(centres) + 0.5, None, int(0.3 * cell_texels), surround)
 
 
+def picture(rng: np.random.Generator, side: int) -> Pattern:
+    """A picture of the world at large, `side` x `side` texels: dead leaves, of no board.
+
+    Shapes that cover each other, their sizes distributed as the inverse cube, have the statistics of natural images
+    (Lee, Mumford, Huang 2001). Here discs and rotated rectangles, plain, shaded or cloudy.
+    """
+    image = background(rng, side, side)
+    smallest, largest = 4.0, side / 4.0
+    for _ in range(int(rng.integers(300, 1500))):
+        # Inverse cumulative distribution of r^-3 between both sizes.
+        radius = (smallest**-2 - rng.random() * (smallest**-2 - largest**-2)) ** -0.5
+        centre = rng.uniform(0, side, 2)
+        shape = np.zeros((side, side), dtype=np.uint8) if radius > 40 else None
+        shade = float(rng.beta(0.8, 0.8))
+        if shape is None:
+            _leaf(rng, image, centre, radius, shade)
+        else:
+            _leaf(rng, shape, centre, radius, 255.0)
+            box = cv2.boundingRect(shape)
+            part = (slice(box[1], box[1] + box[3]), slice(box[0], box[0] + box[2]))
+            inside = shape[part] > 0
+            image[part][inside] = _surface(rng, shade, *inside.shape)[inside]
+    middle = np.array([(side - 1) / 2, (side - 1) / 2])
+    return Pattern(image.clip(0.0, 1.0), np.zeros((0, 2)), None, middle, np.full(2, side / 3))
+
+
+def _leaf(
+    rng: np.random.Generator, image: np.ndarray, centre: Float[np.ndarray, "2"], radius: float, shade: float
+) -> None:
+    """A disc or a rotated rectangle, drawn into the image."""
+    if rng.random() < 0.5:
+        cv2.circle(image, (int(centre[0]), int(centre[1])), int(radius), shade, -1)
+        return
+    sides = (2.0 * radius, 2.0 * radius * float(rng.uniform(0.2, 1.0)))
+    box = cv2.boxPoints(((float(centre[0]), float(centre[1])), sides, float(rng.uniform(0, 90))))
+    cv2.fillConvexPoly(image, box.astype(np.int32), shade)
+
+
+def _surface(rng: np.random.Generator, shade: float, height: int, width: int) -> Float[np.ndarray, "height width"]:
+    """A plain grey, with clouds on half of the surfaces, in uneven light."""
+    surface = np.full((height, width), shade, dtype=np.float32)
+    if rng.random() < 0.5:
+        cells = int(rng.integers(3, 24))
+        coarse = rng.normal(size=(cells, cells)).astype(np.float32)
+        surface += rng.uniform(0.0, 0.2) * np.asarray(
+            cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+        )
+    return surface * _shading(rng, height, width)
+
+
 def _placed(
     rng: np.random.Generator,
     board: Float[np.ndarray, "h w"],

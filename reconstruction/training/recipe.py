@@ -4,16 +4,20 @@ import dataclasses
 import hashlib
 import json
 from dataclasses import dataclass, replace
+from typing import Any
 
 
 @dataclass(frozen=True)
 class DataRecipe:
     """Simulated sequences: `sequences` of `windows` windows of a `size` x `size` crop.
 
-    `checkerboards` is their share, `others` that of circle grids and ChArUco boards, the rest are AprilGrids with bits
-    of `smallest_bit_px` pixels or more. Boards are tilted by up to `largest_tilt_deg`, windows last 10 ms to
-    `longest_window_ms`. Scenes in which the board comes near to edge-on are kept only with `edge_on`. `scaling` of the
-    voxel grids and the moment of the window that its image is of, as `ReconstructionNetwork.scaling` and `shown_at`.
+    `checkerboards` is their share, `others` that of circle grids and ChArUco boards, `pictures` that of pictures of no
+    board at all, the rest are AprilGrids with bits of `smallest_bit_px` pixels or more. Boards are tilted by up to
+    `largest_tilt_deg`, windows last 10 ms to `longest_window_ms`. Scenes in which the board comes near to edge-on are
+    kept only with `edge_on`. The fastest image motion of a sequence lies between `slowest_px` and `fastest_px` pixels
+    per window; the share `swinging` of the sequences moves as a hand does, slowly where it turns back. `scaling` of
+    the voxel grids and the moment of the window that its image is of, as `ReconstructionNetwork.scaling` and
+    `shown_at`.
     """
 
     sequences: int = 300
@@ -25,6 +29,10 @@ class DataRecipe:
     largest_tilt_deg: float = 50.0
     longest_window_ms: float = 50.0
     edge_on: bool = True
+    pictures: float = 0.0
+    slowest_px: float = 1.5
+    fastest_px: float = 25.0
+    swinging: float = 0.0
     scaling: str = "window"
     shown_at: float = 1.0
     seed: int = 2026
@@ -69,6 +77,7 @@ class Recipe:
     )
     architecture: str = "FoldedFireNet"
     channels: int = 32
+    detail: int = 16
     num_bins: int = 5
     learning_rate: float = 2e-3
     warm_up_steps: int = 50
@@ -93,8 +102,20 @@ class Recipe:
 
 
 def fingerprint(recipe: DataRecipe | Recipe) -> str:
-    """Twelve hexadecimal digits that change with any setting."""
-    return hashlib.sha256(json.dumps(dataclasses.asdict(recipe), sort_keys=True).encode()).hexdigest()[:12]
+    """Twelve hexadecimal digits that change with any setting.
+
+    Of what differs from the defaults: a setting that is added later, with what was done before as its default, leaves
+    the fingerprints of older recipes as they are. So no default may ever be changed.
+    """
+    return hashlib.sha256(json.dumps(_chosen(recipe), sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _chosen(settings: Any) -> Any:
+    """The settings that differ from their defaults; of the data and the parent likewise."""
+    if not dataclasses.is_dataclass(settings):
+        return [_chosen(item) for item in settings] if isinstance(settings, tuple) else settings
+    values = {field.name: (getattr(settings, field.name), field.default) for field in dataclasses.fields(settings)}
+    return {name: _chosen(value) for name, (value, default) in values.items() if value != default}
 
 
 PATTERNS_V1 = Recipe()
@@ -148,4 +169,33 @@ PATTERNS_V3 = replace(
     parent=_MEMORY,
     seed=5,
 )
-RECIPES = {"patterns_v1": PATTERNS_V1, "patterns_v3": PATTERNS_V3}
+# Many more scenes, of which many are slow or move as a hand does, and clips twice as long: made for a GPU.
+PATTERNS_V4 = replace(
+    PATTERNS_V3,
+    data=replace(_CORNERS.data, sequences=2000, slowest_px=0.5, fastest_px=28.0, swinging=0.5, seed=2029),
+    stages=(
+        Stage(crop=96, windows=24, segments=2, batch=32, clips=2000),
+        Stage(crop=96, windows=48, segments=1, batch=32, clips=900, warm_up=4),
+    ),
+    learning_rate=2e-3,
+    falling_share=0.9,
+    displacement_weight=1.0,
+    parent=PATTERNS_V3,
+    seed=6,
+)
+# FireNet (Scheerlinck et al. 2020) in the way it was meant: the world at large, images of the window's end.
+FIRENET_PICTURES = Recipe(
+    data=DataRecipe(
+        sequences=600, checkerboards=0.0, pictures=1.0, longest_window_ms=100.0, edge_on=False, swinging=0.5, seed=2030
+    ),
+    stages=(Stage(crop=96, windows=24, segments=2, batch=16, clips=650),),
+    architecture="FireNet",
+    channels=16,
+    seed=7,
+)
+RECIPES = {
+    "patterns_v1": PATTERNS_V1,
+    "patterns_v3": PATTERNS_V3,
+    "patterns_v4": PATTERNS_V4,
+    "firenet_pictures": FIRENET_PICTURES,
+}

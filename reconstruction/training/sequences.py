@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal.simulation.event_sensor import EventSensor, EventSensorConfig
 from reconstruction.training.motion import Path, View, apply_homography, speed_profile
-from reconstruction.training.patterns import Pattern, aprilgrid, charuco, checkerboard, circle_grid
+from reconstruction.training.patterns import Pattern, aprilgrid, charuco, checkerboard, circle_grid, picture
 from reconstruction.training.recipe import DataRecipe
 
 # What the network's output means: the pattern's black and white, with room for overshoot in 8 bits.
@@ -73,7 +73,9 @@ def training_scene(rng: np.random.Generator, recipe: DataRecipe) -> Scene:
 def _any_training_scene(rng: np.random.Generator, recipe: DataRecipe) -> Scene:
     size, surround = recipe.size, recipe.size * _SUPERSAMPLING // 2
     kind = rng.random()
-    if kind < recipe.checkerboards:
+    if kind >= 1.0 - recipe.pictures:
+        pattern = picture(rng, 5 * surround)
+    elif kind < recipe.checkerboards:
         cell = int(np.exp(rng.uniform(np.log(7), np.log(34))) * _SUPERSAMPLING)
         pattern = checkerboard(rng, int(rng.integers(4, 13)), int(rng.integers(3, 10)), cell, surround)
     elif kind < recipe.checkerboards + recipe.others:
@@ -93,8 +95,11 @@ def _any_training_scene(rng: np.random.Generator, recipe: DataRecipe) -> Scene:
         tilt=_tilt(rng, recipe.largest_tilt_deg),
         amplitude=float(np.exp(rng.uniform(np.log(10), np.log(70)))),
     )
-    top_speed = float(np.exp(rng.uniform(np.log(1.5), np.log(25))))
-    return _moving(rng, pattern, view, recipe.windows, top_speed=top_speed, longest_ms=recipe.longest_window_ms)
+    top_speed = float(np.exp(rng.uniform(np.log(recipe.slowest_px), np.log(recipe.fastest_px))))
+    scene = _moving(rng, pattern, view, recipe.windows, top_speed=top_speed, longest_ms=recipe.longest_window_ms)
+    if recipe.swinging and rng.random() < recipe.swinging:
+        return replace(scene, travelled=scene.path.swing(recipe.windows, top_speed, scene.samples))
+    return scene
 
 
 def _least_foreshortening(scene: Scene) -> float:
