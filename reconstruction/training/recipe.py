@@ -169,7 +169,8 @@ PATTERNS_V3 = replace(
     parent=_MEMORY,
     seed=5,
 )
-# Many more scenes, of which many are slow or move as a hand does, and clips twice as long: made for a GPU.
+# Many more scenes, of which many are slow or move as a hand does, and longer clips: made for a GPU. `--parent
+# models/patterns_v3.safetensors` spares the parents.
 PATTERNS_V4 = replace(
     PATTERNS_V3,
     data=replace(_CORNERS.data, sequences=2000, slowest_px=0.5, fastest_px=28.0, swinging=0.5, seed=2029),

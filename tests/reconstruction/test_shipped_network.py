@@ -14,6 +14,7 @@ from reconstruction.training.sequences import evaluation_scene, windows
 
 WEIGHTS = MODELS_FOLDER / f"{DEFAULT_NETWORK}.safetensors"
 SHIPPED = sorted(file.stem for file in MODELS_FOLDER.glob("*.safetensors"))
+FOR_BOARDS = [name for name in SHIPPED if name != "firenet_pictures"]
 
 
 @pytest.fixture(autouse=True)
@@ -57,7 +58,17 @@ def test_card_states_what_a_fresh_measurement_gives():
     assert abs(fresh.reconstructed.latency_s) < 0.5e-3
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+def test_a_network_that_never_saw_a_board_shows_dark_and_bright():
+    network = reconstruction.load_network("firenet_pictures")
+    scene = evaluation_scene(np.random.default_rng(4), 12, top_speed=8.0, shown_at=network.shown_at)
+    reconstructor = reconstruction.Reconstructor(network, scene.view.width, scene.view.height)
+    for window in windows(scene, seed=4):
+        image = reconstructor(window.x, window.y, window.t_us, window.p, window.span_us)
+    seen = window.target[60:-60, 60:-60], image[60:-60, 60:-60]
+    assert np.corrcoef(seen[0].ravel(), seen[1].ravel())[0, 1] > 0.6
+
+
+@pytest.mark.parametrize("name", FOR_BOARDS)
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 def test_board_is_found_in_what_it_reconstructs(precision: str, name: str):
     network = reconstruction.load_network(name)

@@ -136,16 +136,85 @@ def test_data_are_generated_once_and_completed_after_an_interruption(tmp_path: P
     folder = next(tmp_path.iterdir())
     sequence = folder / "0001.npz"
     kept = (folder / "0000.npz").stat().st_mtime_ns
-    voxels = np.array(first.voxels)
+    voxels = first.voxels.clone()
     for name in ("voxels.npy", "targets.npy", "0001.npz"):
         (folder / name).unlink()
     again = load_or_generate(TINY.data, 5, tmp_path, lambda _, done, total: stages.append((done, total)))
     assert sequence.exists()
     assert (folder / "0000.npz").stat().st_mtime_ns == kept
-    np.testing.assert_array_equal(again.voxels, voxels)
-    np.testing.assert_array_equal(again.voxels, tiny_dataset.voxels)  # and they depend on the recipe only
+    assert torch.equal(again.voxels, voxels)
+    assert torch.equal(again.voxels, tiny_dataset.voxels)  # and they depend on the recipe only
     assert stages[-1] == (3, 3)
     assert voxels.shape == (3, 8, 5, 32, 32)
+
+
+def test_several_processes_generate_what_one_does(tiny_dataset: Dataset, tmp_path: Path):
+    stages: list[tuple[int, int]] = []
+    dataset = load_or_generate(TINY.data, 5, tmp_path, lambda _, done, total: stages.append((done, total)), workers=2)
+    assert torch.equal(dataset.voxels, tiny_dataset.voxels)
+    assert torch.equal(dataset.targets, tiny_dataset.targets)
+    assert stages == [(0, 3), (1, 3), (2, 3), (3, 3)]
+
+
+def test_a_finished_training_is_taken_from_its_checkpoint(tiny_dataset: Dataset, tmp_path: Path):
+    assert loop.finished(TINY, tmp_path / "run.pt") is None
+    trained = loop.train(TINY, tiny_dataset, tmp_path / "run.pt")
+    found = loop.finished(TINY, tmp_path / "run.pt")
+    assert found is not None
+    assert found.machine == trained.machine
+    assert "CPU thread" in found.machine
+    assert (found.step, found.seconds, found.history) == (trained.step, trained.seconds, trained.history)
+    for name, value in trained.average.state_dict().items():
+        assert torch.equal(found.average.state_dict()[name], value), name
+    assert loop.finished(replace(TINY, seed=5), tmp_path / "run.pt") is None
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
+def test_replayed_steps_are_the_steps_themselves(tiny_dataset: Dataset):
+    recipe = replace(TINY, precision="float32")
+    voxels, targets = (tensor.cuda() for tensor in tiny_dataset.clip(np.random.default_rng(0), TINY.stages[0]))
+    gradients = []
+    for make in (loop._eager, loop._Replayed):
+        network = loop._start(recipe, device="cuda").network
+        segment = make(network, recipe)
+        _, state = segment(voxels, targets, None, 2)
+        segment(voxels, targets, state, 0)
+        gradients.append([parameter.grad for parameter in network.parameters()])
+    for one, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), top_speed=st.floats(0.5, 28.0))
+def test_a_swinging_hand_never_exceeds_its_top_speed_and_slows_down(seed: int, top_speed: float):
+    scene = training_scene(np.random.default_rng(seed), DataRecipe(windows=8, size=32))
+    travelled = scene.path.swing(24, top_speed, 16)
+    speed = 16 * np.diff(travelled)
+    assert travelled.shape == (24 * 16 + 1,)
+    assert travelled[0] == 0
+    assert (speed >= 0).all()
+    assert speed.max() <= top_speed * (1 + 1e-9)
+    assert speed.max() > 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pictures_are_of_no_board(seed: int):
+    recipe = DataRecipe(pictures=1.0, windows=3, size=32, slowest_px=2.0)
+    scene = training_scene(np.random.default_rng(seed), recipe)
+    assert scene.pattern.corners.shape == (0, 2)
+    assert 0.0 <= scene.pattern.texture.min() < scene.pattern.texture.max() <= 1.0
+    assert len(np.unique(scene.pattern.texture)) > 100  # greys, not a board's two
+    for window in windows(scene, seed):
+        assert window.corners.shape == window.velocity.shape == (0, 2)
+        assert len(window.t_us)
+
+
+def test_a_setting_at_its_default_leaves_the_fingerprint():
+    """What is added later must not disown weights that were trained before."""
+    assert fingerprint(Recipe()) == "44136fa355b3"  # of nothing chosen: the SHA-256 of {}
+    assert fingerprint(Recipe(detail=16)) == fingerprint(Recipe())
+    assert fingerprint(Recipe(data=DataRecipe(pictures=0.0, seed=1))) == fingerprint(Recipe(data=DataRecipe(seed=1)))
+    assert fingerprint(Recipe(parent=Recipe())) != fingerprint(Recipe())
 
 
 def test_fingerprint_changes_with_any_setting():
