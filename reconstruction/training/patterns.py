@@ -9,6 +9,7 @@ from jaxtyping import Float
 # An AprilGrid tag of the family 36h11 is 6 data bits wide, with Kalibr's two-bit border on either side.
 _TAG_BITS = 10
 _TAG_COUNT = 587
+_PLAIN_BELOW = 40.0  # texels; on smaller shapes shades and clouds would not be seen
 
 
 @dataclass(frozen=True)
@@ -101,16 +102,16 @@ def picture(rng: np.random.Generator, side: int) -> Pattern:
         # Inverse cumulative distribution of r^-3 between both sizes.
         radius = (smallest**-2 - rng.random() * (smallest**-2 - largest**-2)) ** -0.5
         centre = rng.uniform(0, side, 2)
-        shape = np.zeros((side, side), dtype=np.uint8) if radius > 40 else None
         shade = float(rng.beta(0.8, 0.8))
-        if shape is None:
+        if radius < _PLAIN_BELOW:
             _leaf(rng, image, centre, radius, shade)
-        else:
-            _leaf(rng, shape, centre, radius, 255.0)
-            box = cv2.boundingRect(shape)
-            part = (slice(box[1], box[1] + box[3]), slice(box[0], box[0] + box[2]))
-            inside = shape[part] > 0
-            image[part][inside] = _surface(rng, shade, *inside.shape)[inside]
+            continue
+        mask = np.zeros((side, side), dtype=np.uint8)
+        _leaf(rng, mask, centre, radius, 255.0)
+        left, top, width, height = cv2.boundingRect(mask)
+        part = (slice(top, top + height), slice(left, left + width))
+        inside = mask[part] > 0
+        image[part][inside] = _surface(rng, shade, height, width)[inside]
     middle = np.array([(side - 1) / 2, (side - 1) / 2])
     return Pattern(image.clip(0.0, 1.0), np.zeros((0, 2)), None, middle, np.full(2, side / 3))
 
