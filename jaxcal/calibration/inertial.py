@@ -1,5 +1,6 @@
 """IMU samples, the biases' random walk, and the weak motion prior that keeps unobserved knots defined."""
 
+import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -8,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxcal.calibration.inertial_calibrated import reduce_batch
 from jaxcal.calibration.state import RigState, SharedLayout
-from jaxcal.imu import imu_model, predict_with_jacobian, respond
+from jaxcal.imu import imu_model, respond
 from jaxcal.trajectory import Increments, basis_matrix, increments, rotation_at, so3, weights
 
 # Knot intervals are reduced in batches of this many.
@@ -144,17 +146,7 @@ def _sample_rows(
     own = layout.imus[imu]
     basis = layout.gravity_basis(state.gravity)
 
-    def plain(u: Array, reading: Array, window: _Window) -> tuple[Array, Array]:
-        """`calibrated` at the rig's origin, in closed form."""
-        point = rotation_at(window.first, window.increments, u, dt, order)
-        second = weights(basis_matrix(order), u, dt, 2)
-        ends = jnp.stack([1.0 - u, u])
-        predicted, by_window, by_gravity = predict_with_jacobian(
-            point, second @ window.control, second, state.gravity, basis, ends @ window.bias
-        )
-        return jnp.concatenate([by_window.reshape(6, -1), by_gravity, (predicted - reading)[:, None]], axis=1), ends
-
-    def general(u: Array, reading: Array, window: _Window) -> tuple[Array, Array]:
+    def of_sample(u: Array, reading: Array, window: _Window) -> tuple[Array, Array]:
         u = u + (state.imu_shift[imu] - data.shift) / dt
         motion = _motion(window, u, dt, state.gravity, order)
         ends = jnp.stack([1.0 - u, u])
@@ -177,28 +169,45 @@ def _sample_rows(
         predicted = response(motion.value, zero) + ends @ window.bias
         return jnp.concatenate([*columns, by_gravity, (predicted - reading)[:, None]], axis=1), ends
 
-    return general if own.size else plain
+    return of_sample
+
+
+def _reduce_any(
+    state: RigState, layout: SharedLayout, imu: int, data: ImuSamples, dt: Array, order: int, parts: tuple
+) -> tuple[Array, Array, Array]:
+    """Sums over the samples of each of some intervals: rows times rows, times biases, biases times biases."""
+    rows_of = _sample_rows(state, layout, imu, data, dt, order)
+
+    def interval(u: Array, reading: Array, present: Array, window: _Window) -> tuple[Array, Array, Array]:
+        rows, ends = jax.vmap(rows_of, in_axes=(0, 0, None))(u, reading, window)
+        whiten = present[:, None] * data.inverse_sigma  # (S, 6)
+        rows, by_bias = rows * whiten[..., None], ends[:, :, None] * whiten[:, None, :]  # (S, 6, n + s + 1), (S, 2, 6)
+        flat = rows.reshape(-1, rows.shape[-1])
+        with_bias = jnp.einsum("sei,six->eix", by_bias, rows)
+        return flat.T @ flat, with_bias, jnp.einsum("sei,sfi->efi", by_bias, by_bias)
+
+    return jax.vmap(interval)(*parts)
+
+
+def _reduce_calibrated(
+    state: RigState, layout: SharedLayout, imu: int, data: ImuSamples, dt: Array, order: int, parts: tuple
+) -> tuple[Array, Array, Array]:
+    """As `_reduce_any`, of an IMU that has no shared coordinates of its own."""
+    *samples, window = parts
+    chain = (window.first, window.increments, window.control, window.bias)
+    basis = layout.gravity_basis(state.gravity)
+    return reduce_batch(tuple(samples), *chain, data.inverse_sigma, state.gravity, basis, dt)
 
 
 def linearise_imu(state: RigState, data: InertialData, order: int, layout: SharedLayout, imu: int) -> IntervalEquations:
     """Equations of all samples of one IMU."""
     samples = data.samples[imu]
     intervals = samples.fraction.shape[0]
-    rows_of = _sample_rows(state, layout, imu, samples, data.dt, order)
     n = 6 * order
-
-    def interval(parts: tuple) -> tuple[Array, Array, Array]:
-        u, reading, present, window = parts
-        rows, ends = jax.vmap(rows_of, in_axes=(0, 0, None))(u, reading, window)
-        whiten = present[:, None] * samples.inverse_sigma  # (S, 6)
-        rows, by_bias = rows * whiten[..., None], ends[:, :, None] * whiten[:, None, :]  # (S, 6, n + s + 1), (S, 2, 6)
-        flat = rows.reshape(-1, rows.shape[-1])
-        with_bias = jnp.einsum("sei,six->eix", by_bias, rows)
-        return flat.T @ flat, with_bias, jnp.einsum("sei,sfi->efi", by_bias, by_bias)
-
     parts = (samples.fraction, samples.readings, samples.present, _chain_windows(state, intervals, order, imu))
     batches = jax.tree.map(lambda leaf: leaf.reshape(-1, INTERVAL_BATCH, *leaf.shape[1:]), parts)
-    reduced = jax.lax.map(jax.vmap(interval), batches)
+    reduce = _reduce_any if layout.imus[imu].size else _reduce_calibrated
+    reduced = jax.lax.map(functools.partial(reduce, state, layout, imu, samples, data.dt, order), batches)
     gram, with_bias, bias_bias = (leaf.reshape(intervals, *leaf.shape[2:]) for leaf in reduced)
     shared = gram[:, n:, n:].sum(axis=0)
     return IntervalEquations(

@@ -148,7 +148,8 @@ def linearise_rolling(
         def corner(i: Array, u: Array, point: Array, by_shape: Array, pixel: Array, seen: Array, v: Array) -> Array:
             pose = _corner_pose(spline, chain, R, t, i, u)
             rotated = pose.rotation @ point
-            projected, by_point, by_lens = pulled_back(template, lens, along, rotated + pose.translation, seen)
+            projected, by_point, by_lens = pulled_back(template, lens, rotated + pose.translation, seen)
+            by_lens = by_lens if along is None else by_lens @ along
             by_pose = jnp.concatenate([-by_point @ so3.hat(rotated), by_point], axis=1)  # (2, 6)
             by_shift = (by_pose @ pose.by_shift)[:, None]
             rows = [by_pose @ pose.by_window, by_pose @ pose.by_extrinsics, by_shift, by_lens, v * by_shift]

@@ -1,7 +1,7 @@
 """Corners of the target: reprojection residuals, reduced frame by frame before the chain sees them."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import equinox as eqx
@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.calibration.state import RigState
 from jaxcal.cameras import CameraModel
+from jaxcal.estimation.scalars import written_out
 from jaxcal.trajectory import PoseSpline, basis_matrix, increments, rotation_at, so3, weights
 
 # Frames are reduced in batches of this many: large enough to vectorise, small enough to stay in the cache.
@@ -212,23 +213,42 @@ def equations_of_each_frame(
 
 
 def pulled_back(
-    template: CameraModel,
-    lens: Float[Array, " n"],
-    along: Float[Array, "n n"] | None,
-    camera_point: Float[Array, "3"],
-    seen: Bool[Array, ""],
+    template: CameraModel, lens: Float[Array, " n"], camera_point: Float[Array, "3"], seen: Bool[Array, ""]
 ) -> tuple[Float[Array, "2"], Float[Array, "2 3"], Float[Array, "2 n"]]:
-    """The pixel of one point, with its derivatives by the point and by the lens (along its basis)."""
+    """The pixel of one point, with its derivatives by the point and by the lens."""
     # What is not seen may lie outside the lens's domain, where a projection may be anything; so it is put elsewhere.
     camera_point = jnp.where(seen, camera_point, jnp.array(_HARMLESS))
+    pixel, by_point, by_lens = zip(*_coordinates(template, lens, camera_point), strict=True)
+    return (
+        jnp.stack(pixel),
+        jnp.stack([jnp.stack(row) for row in by_point]),
+        jnp.stack([jnp.concatenate([jnp.atleast_1d(part) for part in row]) for row in by_lens]),
+    )
+
+
+def _coordinates(
+    template: CameraModel, lens: Float[Array, " n"], camera_point: Float[Array, "3"]
+) -> list[tuple[Array, Sequence[Array], Sequence[Array]]]:
+    """Of u and of v: itself, its derivatives by the point's coordinates, and by the lens, in parts of any length.
+
+    Pulled back coordinate by coordinate: twice as fast as `jacrev`, which carries a batch of unit vectors along.
+    """
 
     def project(camera_point: Array, lens: Array) -> Array:
         return template.with_parameters(lens).project(camera_point)
 
-    pixel, pull = jax.vjp(project, camera_point, lens)
-    rows = [pull(unit) for unit in (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))]
-    by_lens = jnp.stack([row[1] for row in rows])
-    return pixel, jnp.stack([row[0] for row in rows]), by_lens if along is None else by_lens @ along
+    by_numbers = written_out(project, (3, lens.shape[0]))
+    if by_numbers is None:
+        pixel, pull = jax.vjp(project, camera_point, lens)
+        pulled = [pull(unit) for unit in (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))]
+        return [(value, list(by_point), [by_lens]) for value, (by_point, by_lens) in zip(pixel, pulled, strict=True)]
+
+    def of(coordinate: int) -> tuple[Array, Sequence[Array], Sequence[Array]]:
+        value, pull = jax.vjp(lambda *numbers: by_numbers(numbers[:3], numbers[3:])[coordinate], *camera_point, *lens)
+        by = pull(jnp.ones_like(value))
+        return value, by[:3], by[3:]
+
+    return [of(0), of(1)]
 
 
 def _reduce_corners(
@@ -251,31 +271,36 @@ def _reduce_corners(
     seen = weight > 0
     # What is not seen may lie outside the lens's domain, where a projection may be anything; so it is put elsewhere.
     camera_points = jnp.where(seen, rotated + t_cam_target[:, None], jnp.array(_HARMLESS)[:, None])
-
-    def corner(camera_point: Array) -> tuple[Array, tuple[Array, Array], tuple[Array, Array]]:
-        def project(camera_point: Array, lens: Array) -> Array:
-            return template.with_parameters(lens).project(camera_point)
-
-        # Pulled back coordinate by coordinate: twice as fast as `jacrev`, which carries a batch of unit vectors along.
-        pixel, pull = jax.vjp(project, camera_point, lens)
-        return pixel, pull(jnp.array([1.0, 0.0])), pull(jnp.array([0.0, 1.0]))
-
+    coordinates = jax.vmap(lambda point: _coordinates(template, lens, point), in_axes=1, out_axes=-1)(camera_points)
     # Barriers keep the compiler from computing a projection anew for every row that is made of it.
-    projected, *pulled = jax.lax.optimization_barrier(jax.vmap(corner, in_axes=1, out_axes=-1)(camera_points))
-    residual = projected - pixels
-    rho, robust_weight = loss(weight * jnp.sum(residual**2, axis=0))
+    coordinates = jax.lax.optimization_barrier(coordinates)
+    errors = [value - measured for (value, _, _), measured in zip(coordinates, pixels, strict=True)]
+    rho, robust_weight = loss(weight * (errors[0] ** 2 + errors[1] ** 2))
     root = jax.lax.optimization_barrier(jnp.sqrt(jnp.where(seen, weight * robust_weight, 0.0)))
     x, y, z = rotated
     gram = jnp.zeros(())
-    for (by_point, by_lens), error in zip(pulled, residual, strict=True):
+    for (_, by_point, by_lens), error in zip(coordinates, errors, strict=True):
         a, b, c = by_point
-        by_lens = by_lens if along is None else along.T @ by_lens
-        by_rotation = jnp.stack([y * c - z * b, z * a - x * c, x * b - y * a])  # -by_point hat(rotated)
-        by_shape = jnp.einsum("jn,tjn->tn", R_cam_target.T @ by_point, by_target)
-        parts = [part * root for part in (by_rotation, by_point, by_lens, by_shape, error[None])]
-        rows = jnp.concatenate(jax.lax.optimization_barrier(parts))
+        by_rotation = [y * c - z * b, z * a - x * c, x * b - y * a]  # -by_point hat(rotated)
+        if along is not None:
+            by_lens = [along.T @ jnp.concatenate([jnp.atleast_2d(part) for part in by_lens])]
+        by_shape = jnp.einsum("jn,tjn->tn", R_cam_target.T @ jnp.stack(by_point), by_target)
+        parts = [*by_rotation, *by_point, *by_lens, *([by_shape] if len(by_target) else []), error]
+        parts = [jnp.atleast_2d(part) * root for part in parts]
+        rows = jax.lax.platform_dependent(*parts, cpu=_one_by_one, default=lambda *parts: jnp.concatenate(parts))
         gram = gram + rows @ rows.T
     return gram, 0.5 * jnp.sum(jnp.where(seen, rho, 0.0))
+
+
+def _one_by_one(*parts: Float[Array, "_ N"]) -> Float[Array, "m N"]:
+    """The parts one below the other. A CPU puts each in its place in a loop of its own; joined as one expression, it
+    would ask for every number anew which part that is of."""
+    rows = jnp.zeros((sum(map(len, parts)), parts[0].shape[1]))
+    start = 0
+    for part in parts:
+        rows = jax.lax.dynamic_update_slice(rows, part, (start, 0))
+        start += len(part)
+    return rows
 
 
 def _lift(

@@ -1,5 +1,6 @@
 """Continuous-time trajectories: cumulative B-splines on SO(3) x R^3."""
 
+from jaxcal.trajectory.batched import RotationsAt, rotations_at
 from jaxcal.trajectory.bspline import (
     Increments,
     PoseSpline,
@@ -15,9 +16,11 @@ __all__ = [
     "Increments",
     "PoseSpline",
     "RotationPoint",
+    "RotationsAt",
     "basis_matrix",
     "cumulative_basis_matrix",
     "increments",
     "rotation_at",
+    "rotations_at",
     "weights",
 ]

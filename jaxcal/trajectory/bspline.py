@@ -34,13 +34,13 @@ def cumulative_basis_matrix(order: int) -> np.ndarray:
 
 
 def weights(
-    matrix: np.ndarray, u: Float[Array, ""], dt: float | Float[Array, ""], derivative: int
-) -> Float[Array, " k"]:
+    matrix: np.ndarray, u: Float[Array, "*T"], dt: float | Float[Array, ""], derivative: int
+) -> Float[Array, "k *T"]:
     """Derivative in time of the (cumulative) basis functions at `u` in an interval of `dt` seconds."""
     k = matrix.shape[0]
     factors = [float(math.perm(n, derivative)) for n in range(k)]
     powers = jnp.stack([u ** max(n - derivative, 0) * factors[n] for n in range(k)])
-    return jnp.asarray(matrix) @ powers / dt**derivative
+    return jnp.tensordot(jnp.asarray(matrix), powers, axes=1) / dt**derivative
 
 
 class RotationPoint(eqx.Module):

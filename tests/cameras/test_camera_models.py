@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from jaxcal.cameras import CameraModel, Pinhole, camera_model, names
 from jaxcal.errors import CalibrationError
+from jaxcal.estimation.scalars import written_out
 
 NAMES = sorted(LENSES)
 COUNT = 24  # rays looked at together: one shape for all tests of a model
@@ -89,6 +90,22 @@ def points_in_view(draw: st.DrawFn, name: str, part: float = 1.0) -> np.ndarray:
     return 10.0 ** rng.uniform(-1.3, 1.3, (COUNT, 1)) * ray_at(angle, azimuth)
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def by_numbers(name: str, parameters: jax.Array, point: jax.Array) -> tuple:
+    """Pixel of one point and its derivatives, as the solver takes them, and as autodiff gives them."""
+
+    def project(point: jax.Array, parameters: jax.Array) -> jax.Array:
+        return template(name).with_parameters(parameters).project(point)
+
+    written = written_out(project, (3, parameters.shape[0]))
+    assert written is not None, "the solver will be slow with this lens"
+
+    def joined(point: jax.Array, parameters: jax.Array) -> jax.Array:
+        return jnp.stack(written(list(point), list(parameters)))
+
+    return tuple((f(point, parameters), *jax.jacrev(f, argnums=(0, 1))(point, parameters)) for f in (joined, project))
+
+
 # --- the matrix ------------------------------------------------------------------------------------------------------
 
 
@@ -106,6 +123,17 @@ def test_unproject_inverts_project_over_the_whole_domain(name: str, data: st.Dat
     assert np.asarray(there["valid"]).all()
     np.testing.assert_allclose(back["rays"], rays, atol=2e-9)
     np.testing.assert_allclose(back["generic"], rays, atol=2e-9)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in SPLINED])
+@settings(max_examples=10, deadline=None)
+@given(data=st.data())
+def test_every_formula_can_be_written_out_for_the_solver(name: str, data: st.DataObject) -> None:
+    parameters = lens_of(name).parameters
+    for point in data.draw(points_in_view(name))[:4]:
+        ours, expected = by_numbers(name, parameters, jnp.asarray(point))
+        for one, other in zip(ours, expected, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * (1.0 + np.abs(other).max()))
 
 
 @every_model

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
-from jaxcal.trajectory import PoseSpline, basis_matrix, increments, rotation_at, so3, weights
+from jaxcal.trajectory import PoseSpline, basis_matrix, increments, rotation_at, rotations_at, so3, weights
 
 ORDERS = [3, 4, 6]
 
@@ -74,6 +74,39 @@ def test_closed_form_jacobians_equal_autodiff(order: int, u: float, seed: int) -
     point, expected = jacobians_both_ways(random_spline(order, seed).rotations[:order], jnp.asarray(u), order)
     np.testing.assert_allclose(point.rotation_jacobian, expected[0], atol=1e-8)
     np.testing.assert_allclose(point.velocity_jacobian, expected[1], atol=1e-7)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def one_by_one_and_at_once(rotations: jax.Array, u: jax.Array, order: int) -> tuple:
+    """The spline of windows (B, k, 3, 3) at S times each: time after time, and all together."""
+    chain = jax.vmap(increments)(rotations)
+    alone = jax.vmap(
+        lambda first, window, u: jax.vmap(lambda u: rotation_at(first, window, u, 0.1, order))(u), out_axes=0
+    )(rotations[:, 0], chain, u.T)
+    first = jnp.moveaxis(rotations[:, 0], 0, -1)[..., None, :]
+    vectors = jnp.moveaxis(chain.vector, 0, -1)[..., None, :]
+    return alone, rotations_at(first, vectors, u, 0.1, order), chain
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_many_times_at_once_are_each_time_by_itself(order: int, seed: int) -> None:
+    rotations = jnp.stack([random_spline(order, seed + i).rotations[:order] for i in range(3)])
+    u = jnp.asarray(np.random.default_rng(seed).uniform(size=(5, 3)))
+    alone, together, chain = one_by_one_and_at_once(rotations, u, order)
+    np.testing.assert_allclose(jnp.moveaxis(together.rotation, (2, 3), (1, 0)), alone.rotation, atol=1e-12)
+    np.testing.assert_allclose(jnp.moveaxis(together.velocity, (1, 2), (1, 0)), alone.velocity, atol=1e-10)
+    # By control rotations: each increment depends on the two that it lies between.
+    for by, expected, by_first in (
+        (together.rotation_by, alone.rotation_jacobian, together.from_first),
+        (together.velocity_by, alone.velocity_jacobian, jnp.zeros_like(together.from_first)),
+    ):
+        by_left = jnp.einsum("jacsb,bjcd->bsajd", by, chain.by_left)
+        by_right = jnp.einsum("jacsb,bjcd->bsajd", by, chain.by_right)
+        ours = jnp.pad(by_left, [(0, 0)] * 3 + [(0, 1), (0, 0)]) + jnp.pad(by_right, [(0, 0)] * 3 + [(1, 0), (0, 0)])
+        ours = ours.at[:, :, :, 0].add(jnp.einsum("casb->bsac", by_first))
+        np.testing.assert_allclose(ours, expected, atol=1e-10)
 
 
 @jax.jit
