@@ -1,7 +1,7 @@
 """Any camera model as the lens of a small fit: compiled programs of two fixed sizes serve all its calls."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxcal.calibration.generic_lens import Projection
+from jaxcal.calibration.pixel_derivatives import pixel_derivatives
 from jaxcal.cameras import CameraModel
 from jaxcal.programs import stored_jit
 
@@ -35,64 +36,67 @@ class ModelLens:
 
     def _project_one(self, parameters: np.ndarray, points: np.ndarray, with_lens: bool) -> Projection:
         count, corners = points.shape[0], points.shape[-1]
-        flat = points.swapaxes(-1, -2).reshape(-1, 3)
+        flat = points.swapaxes(0, 1).reshape(3, -1)
         # Programs take numpy arrays as they are, which is quicker than to put them on the device first.
         program = _with_lens if with_lens else _without_lens
         outputs = [program(self._template, parameters, chunk) for chunk in _chunks(flat, fill=1.0)]
 
-        def joined(part: int) -> np.ndarray:
-            values = np.concatenate([np.asarray(output[part]) for output in outputs], axis=-1)[..., : len(flat)]
-            values = values.reshape(*values.shape[:-1], count, corners)
-            return np.ascontiguousarray(np.moveaxis(values, -2, 0))
+        def joined(parts: list[list[Array]]) -> np.ndarray:
+            """The parts (M,) or (n, M) of all chunks one below the other, (F, rows, N)."""
+            rows = _join([_join([np.atleast_2d(part) for part in chunk], axis=0) for chunk in parts], axis=1)
+            rows = rows[:, : flat.shape[1]].reshape(len(rows), count, corners)
+            return np.ascontiguousarray(rows.swapaxes(0, 1))
 
-        return Projection(joined(0), joined(1), joined(3) if with_lens else None, joined(2))
+        pixels = joined([[u, v] for u, v in (output.pixel for output in outputs)])
+        by_point = joined([[*of_u, *of_v] for of_u, of_v in (output.by_point for output in outputs)])
+        valid = joined([[output.valid] for output in outputs])[:, 0]
+        by_lens = None
+        if with_lens:
+            of_u, of_v = (joined([list(output.by_lens[c]) for output in outputs]) for c in range(2))
+            by_lens = np.stack([of_u, of_v], axis=2)
+        return Projection(pixels, by_point.reshape(count, 2, 3, corners), by_lens, valid)
 
 
-def _chunks(rows: np.ndarray, fill: float) -> list[np.ndarray]:
-    size = _CHUNK if len(rows) <= _LARGE_CHUNK // 2 else _LARGE_CHUNK
-    padded = np.pad(rows, [(0, -len(rows) % size), (0, 0)], constant_values=fill)
-    return np.split(padded, max(len(padded) // size, 1))
+class _Outputs(NamedTuple):
+    """Of points (M,): pixel, its derivatives by the point and by the lens, of u and of v, all finite; validity."""
+
+    pixel: tuple[Array, Array]
+    by_point: tuple[Sequence[Array], Sequence[Array]]
+    by_lens: tuple[Sequence[Array], Sequence[Array]]
+    valid: Array
 
 
-def _pixel(template: CameraModel, parameters: Array, point: Array) -> Array:
-    return template.with_parameters(parameters).project(point)
+def _join(arrays: list[np.ndarray], axis: int) -> np.ndarray:
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, axis=axis)
+
+
+def _chunks(points: np.ndarray, fill: float) -> list[np.ndarray]:
+    size = _CHUNK if points.shape[1] <= _LARGE_CHUNK // 2 else _LARGE_CHUNK
+    padded = np.pad(points, [(0, 0), (0, -points.shape[1] % size)], constant_values=fill)
+    return np.split(padded, max(padded.shape[1] // size, 1), axis=1)
 
 
 @stored_jit
-def _with_lens(template: CameraModel, parameters: Any, points: Any) -> tuple[Array, Array, Array, Array]:
-    """Pixels (2, M), Jacobian by the point (2, 3, M), validity (M), Jacobian by the lens (n, 2, M); all finite."""
-
-    def one(point: Array) -> tuple[Array, Array, Array, Array]:
-        pixel, pull = jax.vjp(lambda *at: _pixel(template, *at), parameters, point)
-        by_lens, by_point = _pulled(pull)
-        return _finite(pixel, by_point, by_lens.T)
-
-    return jax.vmap(one, out_axes=-1)(points)
+def _with_lens(template: CameraModel, parameters: Any, points: Any) -> _Outputs:
+    """Pixels and derivatives of points (3, M)."""
+    return _outputs(template, parameters, points, with_lens=True)
 
 
 @stored_jit
-def _without_lens(template: CameraModel, parameters: Any, points: Any) -> tuple[Array, Array, Array]:
-    """As `_with_lens`, less the Jacobian by the lens."""
-
-    def one(point: Array) -> tuple[Array, Array, Array]:
-        pixel, pull = jax.vjp(lambda at: _pixel(template, parameters, at), point)
-        (by_point,) = _pulled(pull)
-        return _finite(pixel, by_point, jnp.zeros(0))[:3]
-
-    return jax.vmap(one, out_axes=-1)(points)
+def _without_lens(template: CameraModel, parameters: Any, points: Any) -> _Outputs:
+    """As `_with_lens`, less the derivatives by the lens."""
+    return _outputs(template, parameters, points, with_lens=False)
 
 
-def _pulled(pull: Callable[[Array], tuple[Array, ...]]) -> tuple[Array, ...]:
-    """Jacobians of a pixel, coordinate by coordinate: twice as fast as `jacrev` with its batch of unit vectors."""
-    rows = zip(pull(jnp.array([1.0, 0.0])), pull(jnp.array([0.0, 1.0])), strict=True)
-    return tuple(jnp.stack(both) for both in rows)
+def _outputs(template: CameraModel, parameters: Array, points: Array, *, with_lens: bool) -> _Outputs:
+    def one(point: Array) -> tuple:
+        pixel, by_point, by_lens = zip(*pixel_derivatives(template, parameters, point), strict=True)
+        return pixel, by_point, by_lens if with_lens else ((), ())
 
-
-def _finite(pixel: Array, by_point: Array, by_lens: Array) -> tuple[Array, Array, Array, Array]:
-    """The same, and whether all is finite; zeros where it is not."""
-    # Whether the point lies in the model's domain is not asked: outside, models give pixels far away, and a domain that
+    parts = jax.vmap(one, in_axes=1, out_axes=-1)(jnp.asarray(points))
+    # Whether a point lies in the model's domain is not asked: outside, models give pixels far away, and a domain that
     # ends where the coefficients say would be a wall in the way of the optimisation.
-    valid = jnp.array(True)
-    for part in (pixel, by_point, by_lens):
-        valid = valid & jnp.all(jnp.isfinite(part))
-    return jnp.where(valid, pixel, 0.0), jnp.where(valid, by_point, 0.0), valid, jnp.where(valid, by_lens, 0.0)
+    valid = jnp.full(points.shape[1], True)
+    for part in jax.tree.leaves(parts):
+        valid = valid & jnp.isfinite(part).reshape(-1, points.shape[1]).all(axis=0)
+    return _Outputs(*jax.tree.map(lambda part: jnp.where(valid, part, 0.0), parts), valid)

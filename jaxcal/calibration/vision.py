@@ -1,7 +1,7 @@
 """Corners of the target: reprojection residuals, reduced frame by frame before the chain sees them."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Protocol
 
 import equinox as eqx
@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxcal.calibration.pixel_derivatives import pixel_derivatives
 from jaxcal.calibration.state import RigState
 from jaxcal.cameras import CameraModel
-from jaxcal.estimation.scalars import written_out
 from jaxcal.trajectory import PoseSpline, basis_matrix, increments, rotation_at, so3, weights
 
 # Frames are reduced in batches of this many: large enough to vectorise, small enough to stay in the cache.
@@ -218,37 +218,12 @@ def pulled_back(
     """The pixel of one point, with its derivatives by the point and by the lens."""
     # What is not seen may lie outside the lens's domain, where a projection may be anything; so it is put elsewhere.
     camera_point = jnp.where(seen, camera_point, jnp.array(_HARMLESS))
-    pixel, by_point, by_lens = zip(*_coordinates(template, lens, camera_point), strict=True)
+    pixel, by_point, by_lens = zip(*pixel_derivatives(template, lens, camera_point), strict=True)
     return (
         jnp.stack(pixel),
         jnp.stack([jnp.stack(row) for row in by_point]),
         jnp.stack([jnp.concatenate([jnp.atleast_1d(part) for part in row]) for row in by_lens]),
     )
-
-
-def _coordinates(
-    template: CameraModel, lens: Float[Array, " n"], camera_point: Float[Array, "3"]
-) -> list[tuple[Array, Sequence[Array], Sequence[Array]]]:
-    """Of u and of v: itself, its derivatives by the point's coordinates, and by the lens, in parts of any length.
-
-    Pulled back coordinate by coordinate: twice as fast as `jacrev`, which carries a batch of unit vectors along.
-    """
-
-    def project(camera_point: Array, lens: Array) -> Array:
-        return template.with_parameters(lens).project(camera_point)
-
-    by_numbers = written_out(project, (3, lens.shape[0]))
-    if by_numbers is None:
-        pixel, pull = jax.vjp(project, camera_point, lens)
-        pulled = [pull(unit) for unit in (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))]
-        return [(value, list(by_point), [by_lens]) for value, (by_point, by_lens) in zip(pixel, pulled, strict=True)]
-
-    def of(coordinate: int) -> tuple[Array, Sequence[Array], Sequence[Array]]:
-        value, pull = jax.vjp(lambda *numbers: by_numbers(numbers[:3], numbers[3:])[coordinate], *camera_point, *lens)
-        by = pull(jnp.ones_like(value))
-        return value, by[:3], by[3:]
-
-    return [of(0), of(1)]
 
 
 def _reduce_corners(
@@ -271,7 +246,8 @@ def _reduce_corners(
     seen = weight > 0
     # What is not seen may lie outside the lens's domain, where a projection may be anything; so it is put elsewhere.
     camera_points = jnp.where(seen, rotated + t_cam_target[:, None], jnp.array(_HARMLESS)[:, None])
-    coordinates = jax.vmap(lambda point: _coordinates(template, lens, point), in_axes=1, out_axes=-1)(camera_points)
+    derivatives = functools.partial(pixel_derivatives, template, lens)
+    coordinates = jax.vmap(derivatives, in_axes=1, out_axes=-1)(camera_points)
     # Barriers keep the compiler from computing a projection anew for every row that is made of it.
     coordinates = jax.lax.optimization_barrier(coordinates)
     errors = [value - measured for (value, _, _), measured in zip(coordinates, pixels, strict=True)]
