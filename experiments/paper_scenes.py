@@ -24,6 +24,7 @@ import jaxcal
 from jaxcal.atomic import write_text
 from jaxcal.cameras import CameraModel, Pinhole, PinholeEquidistant, PinholeRadtan
 from jaxcal.detection import detect
+from jaxcal.detection.cache import DetectionCache, detection_key
 from jaxcal.observations import Detections, Frames
 from jaxcal.progress import Progress, track
 from jaxcal.recording import load_frames, load_rig
@@ -181,10 +182,13 @@ def corners(recording: Recording, frames: Frames, name: str, progress: Progress)
     """Corners found in the frames that count; none at all where no frame shows the board."""
     images = [frames.images[number] for number in range(SETTLING_FRAMES, len(frames))]
     counted = Frames(frames.timestamps_ns[SETTLING_FRAMES:], images, frames.image_size)
+    folder = recording.folder / "corners"
+    # `detect` would look anew for what is wrong where nothing was found, each time.
+    kept = DetectionCache(folder, name, detection_key(counted, recording.target)).load()
+    if kept is not None:
+        return kept
     try:
-        return detect(
-            counted, recording.target, workers=1, cache=recording.folder / "corners", progress=progress, name=name
-        )
+        return detect(counted, recording.target, workers=1, cache=folder, progress=progress, name=name)
     except jaxcal.CalibrationError:
         nothing = np.empty(0, np.int64)
         return Detections(counted.timestamps_ns, nothing, nothing, np.empty((0, 2)), counted.image_size)

@@ -26,7 +26,7 @@ from jaxcal.recording.tables import load_detections
 from jaxcal.results.ground_truth import compare_with_ground_truth
 from jaxcal.simulation import paper_rig, write_recording
 
-SECTIONS = ("results", "cameras", "truth", "stress", "speed")
+SECTIONS = ("results", "cameras", "truth", "stress", "speed", "imu-speed")
 README = Path(__file__).resolve().parent.parent / "README.md"
 
 
@@ -43,7 +43,8 @@ def main() -> int:
             "cameras": camera_table,
             "truth": truth_table,
             "stress": stress_table,
-            "speed": speed_table,
+            "speed": lambda: printed_by("bench_cameras.py"),
+            "imu-speed": lambda: printed_by("bench_camera_imu.py"),
         }
         block = makers[section]()
         filled = f"<!-- {section} -->\n{block}\n<!-- /{section} -->"
@@ -151,9 +152,9 @@ def kept_study(name: str, *options: str) -> str:
     return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
 
 
-def speed_table() -> str:
-    """What `bench_cameras.py` prints."""
-    script = Path(__file__).with_name("bench_cameras.py")
+def printed_by(name: str) -> str:
+    """What a benchmark says."""
+    script = Path(__file__).with_name(name)
     done = subprocess.run([sys.executable, str(script)], stdout=subprocess.PIPE, text=True, check=True)
     return done.stdout.strip()
 

@@ -99,4 +99,5 @@ def _outputs(template: CameraModel, parameters: Array, points: Array, *, with_le
     valid = jnp.full(points.shape[1], True)
     for part in jax.tree.leaves(parts):
         valid = valid & jnp.isfinite(part).reshape(-1, points.shape[1]).all(axis=0)
-    return _Outputs(*jax.tree.map(lambda part: jnp.where(valid, part, 0.0), parts), valid)
+    pixel, by_point, by_lens = jax.tree.map(lambda part: jnp.where(valid, part, 0.0), parts)
+    return _Outputs(pixel, by_point, by_lens, valid)

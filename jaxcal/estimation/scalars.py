@@ -88,10 +88,14 @@ def _run(traced: core.ClosedJaxpr, arguments: Sequence[_Numbers]) -> list[_Numbe
 
 def _numbers_of(values: Sequence[Array] | Array | np.ndarray) -> _Numbers:
     """A sequence of numbers, or an array of jax or numpy, entry by entry."""
-    array = hasattr(values, "shape")
-    numbers = np.empty(np.shape(values) if array else len(values), dtype=object)
+    if not isinstance(values, Array | np.ndarray):
+        numbers = np.empty(len(values), dtype=object)
+        for place, number in enumerate(values):
+            numbers[place] = number
+        return numbers
+    numbers = np.empty(values.shape, dtype=object)
     for index in np.ndindex(numbers.shape):
-        numbers[index] = values[index if array else index[0]]  # pyright: ignore[reportArgumentType]
+        numbers[index] = values[index]
     return numbers
 
 

@@ -1,4 +1,4 @@
-"""TwoScaleMemoryNet, of patterns_v3: TwoScaleNet with a second memory, at half of the resolution."""
+"""TwoScaleMemoryNet, of patterns_v3 to v5: TwoScaleNet with a second memory, at half of the resolution."""
 
 from reconstruction.networks.two_scale import TwoScaleNet
 

@@ -67,17 +67,18 @@ Reconstructs grey images of {_subject(recipe)} from events. `reconstruction.load
 {data.sequences} simulated sequences of {data.windows} windows on {data.size}x{data.size} pixels,
 {_scenes(data)}, in perspective, at tilts of up to
 {data.largest_tilt_deg:g} degrees. Image motion of {0.25 * data.slowest_px:.2g} to {data.fastest_px:g} pixels per
-window, with pauses{_swinging(data)}. Event sensor (ESIM model): contrast thresholds 0.1 to 0.5 (log-uniform), ON and
-OFF up to a factor 1.5 apart, 1 to 15 % mismatch from pixel to pixel, refractory time 1 us to 0.5 ms, noise 0.01 to
-3 Hz, leak up to 0.3 Hz, some hot pixels.
+window, with pauses{_swinging(data)}{_lulls(data)}.
+Event sensor (ESIM model): contrast thresholds 0.1 to 0.5 (log-uniform), ON and OFF up to a factor 1.5 apart, 1 to
+15 % mismatch from pixel to pixel, refractory time 1 us to 0.5 ms, noise 0.01 to 3 Hz, leak up to 0.3 Hz, some hot
+pixels.
 No recordings, no third-party images.
 
 ## Recipe
 
-`python -m reconstruction.training --output models/ --name {path.stem}`, {run.seconds / 60:.0f} minutes of training on
+`python -m reconstruction.training --output models/ --name {path.stem}`, {_duration(run.seconds)} of training on
 {run.machine or "two CPU cores"}{_after_parent(recipe)}.
 Loss: {_loss(recipe)}.
-AdamW {recipe.learning_rate:g}, falling to zero over the last {100 * recipe.falling_share:.0f} % of the steps, gradient
+AdamW {recipe.learning_rate:g}, falling to zero over {_falling(recipe)} of the steps, gradient
 norm clipped at {recipe.clip_norm}, weights averaged (decay {recipe.average_decay}); {recipe.precision}.
 
 {stages}
@@ -134,6 +135,18 @@ def _swinging(data: DataRecipe) -> str:
     return f", {100 * data.swinging:.0f} % of them slower where the motion turns back" if data.swinging else ""
 
 
+def _lulls(data: DataRecipe) -> str:
+    return f";\n{100 * data.lulls:.0f} % fall to 2 to 20 % of their speed for 10 to 40 windows" if data.lulls else ""
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60:.0f} minutes"
+
+
+def _falling(recipe: Recipe) -> str:
+    return "all" if recipe.falling_share == 1.0 else f"the last {100 * recipe.falling_share:.0f} %"
+
+
 def _moment(network: ReconstructionNetwork) -> str:
     if network.shown_at == 1.0:
         return "at the END of the window"
@@ -159,6 +172,8 @@ def _loss(recipe: Recipe) -> str:
     text = f"L1 of the image + {recipe.gradient_weight} x L1 of its differences"
     if recipe.displacement_weight > 0:
         text += f" + {recipe.displacement_weight} x displacement of corners (px)"
+    if recipe.unseen_weight < 1.0:
+        text += f";\nplaces past which no edge has come yet count {recipe.unseen_weight:g}"
     return text
 
 

@@ -19,17 +19,17 @@ from jaxcal.progress import Progress, no_progress
 from reconstruction.networks import ARCHITECTURES, ReconstructionNetwork
 from reconstruction.networks.base import State
 from reconstruction.training.data import Dataset
-from reconstruction.training.losses import displacement_loss, image_loss
+from reconstruction.training.losses import displacement_loss, image_loss, weights_of_places
 from reconstruction.training.recipe import Recipe, Stage, fingerprint
 
 HISTORY_STEPS = 50
 _COUNTERS = ("step", "stage", "clip", "seconds", "machine", "loss", "history")
 
-# One segment of a clip, its gradients left in the network: voxels, targets, the state before it (None at a clip's
-# start) and how many windows do not count, to the loss and the state after it.
+# One segment of a clip, its gradients left in the network: voxels, targets, weights of places, the state before it
+# (None at a clip's start) and how many windows do not count, to the loss and the state after it.
 Voxels = Float[torch.Tensor, "t b c h w"]
 Targets = Float[torch.Tensor, "t b 1 h w"]
-Segment = Callable[[Voxels, Targets, State | None, int], tuple[Float[torch.Tensor, ""], State]]
+Segment = Callable[[Voxels, Targets, Targets, State | None, int], tuple[Float[torch.Tensor, ""], State]]
 
 logger = logging.getLogger(__name__)
 
@@ -139,19 +139,21 @@ def _widened(weights: dict[str, torch.Tensor], fresh: dict[str, torch.Tensor]) -
 def _train_on_clip(run: Run, recipe: Recipe, stage: Stage, dataset: Dataset, segment: Segment) -> None:
     rng = np.random.default_rng([recipe.seed, run.stage, run.clip])
     voxels, targets = dataset.clip(rng, stage)
+    weights = weights_of_places(voxels, recipe.num_bins, recipe.unseen_weight)
     state: State | None = None
     for index in range(stage.segments):
         part = slice(index * stage.windows, (index + 1) * stage.windows)
-        loss, state = segment(voxels[part], targets[part], state, stage.warm_up if index == 0 else 0)
+        warm_up = stage.warm_up if index == 0 else 0
+        loss, state = segment(voxels[part], targets[part], weights[part], state, warm_up)
         _optimise(run, recipe, loss)
 
 
 def _eager(network: ReconstructionNetwork, recipe: Recipe) -> Segment:
     """Step by step, as it is written."""
 
-    def segment(voxels: Voxels, targets: Targets, state: State | None, warm_up: int):
+    def segment(voxels: Voxels, targets: Targets, weights: Targets, state: State | None, warm_up: int):
         network.zero_grad(set_to_none=True)
-        loss, after = _segment_loss(network, voxels, targets, state, warm_up, recipe)
+        loss, after = _segment_loss(network, voxels, targets, weights, state, warm_up, recipe)
         loss.backward()
         return loss.detach(), [tensor.detach() for tensor in after]
 
@@ -171,30 +173,28 @@ class _Replayed:
             parameter.grad = torch.zeros_like(parameter)
 
     def __call__(
-        self, voxels: Voxels, targets: Targets, state: State | None, warm_up: int
+        self, voxels: Voxels, targets: Targets, weights: Targets, state: State | None, warm_up: int
     ) -> tuple[Float[torch.Tensor, ""], State]:
+        inputs = {"voxels": voxels, "targets": targets, "weights": weights}
         key = (*voxels.shape, warm_up)
         if key not in self._graphs:
-            self._graphs[key] = self._captured(voxels, targets, warm_up)
+            self._graphs[key] = self._captured(inputs, warm_up)
         graph, tensors = self._graphs[key]
-        for name, given in (("voxels", voxels), ("targets", targets)):
+        for name, given in inputs.items():
             tensors[name].copy_(given)
         for index, kept in enumerate(tensors["before"]):  # nothing remembered is zeros
             kept.zero_() if state is None else kept.copy_(state[index])
         graph.replay()
         return tensors["loss"], [tensor.clone() for tensor in tensors["after"]]
 
-    def _captured(self, voxels: Voxels, targets: Targets, warm_up: int) -> tuple[torch.cuda.CUDAGraph, dict[str, Any]]:
-        tensors: dict[str, Any] = {"voxels": torch.empty_like(voxels), "targets": torch.empty_like(targets)}
-        tensors["voxels"].copy_(voxels)
-        tensors["targets"].copy_(targets)
+    def _captured(self, given: dict[str, torch.Tensor], warm_up: int) -> tuple[torch.cuda.CUDAGraph, dict[str, Any]]:
+        tensors: dict[str, Any] = {name: tensor.clone() for name, tensor in given.items()}
 
         def run() -> None:
             # Nothing may outlive this that holds autograd's nodes: they belong to the stream on which they were made.
             self._network.zero_grad(set_to_none=False)
-            loss, after = _segment_loss(
-                self._network, tensors["voxels"], tensors["targets"], tensors.get("before"), warm_up, self._recipe
-            )
+            parts = (tensors["voxels"], tensors["targets"], tensors["weights"])
+            loss, after = _segment_loss(self._network, *parts, tensors.get("before"), warm_up, self._recipe)
             loss.backward()
             tensors["loss"], tensors["after"] = loss.detach(), [tensor.detach() for tensor in after]
 
@@ -217,6 +217,7 @@ def _segment_loss(
     network: ReconstructionNetwork,
     voxels: Float[torch.Tensor, "t b c h w"],
     targets: Float[torch.Tensor, "t b 1 h w"],
+    weights: Float[torch.Tensor, "t b 1 h w"],
     state: State | None,
     warm_up: int,
     recipe: Recipe,
@@ -232,9 +233,10 @@ def _segment_loss(
             images.append(image)
     assert state is not None
     predicted = torch.stack(images[warm_up:]).float()
-    loss = image_loss(predicted, targets[warm_up:], recipe.gradient_weight)
+    targets, weights = targets[warm_up:], weights[warm_up:]
+    loss = image_loss(predicted, targets, weights, recipe.gradient_weight)
     if recipe.displacement_weight > 0:
-        loss = loss + recipe.displacement_weight * displacement_loss(predicted, targets[warm_up:])
+        loss = loss + recipe.displacement_weight * displacement_loss(predicted, targets, weights)
     return loss, state
 
 

@@ -8,21 +8,52 @@ _WINDOW = 9  # pixels; about the window in which detectors place a corner
 _ROUND = 0.01  # smaller eigenvalue of the mean structure tensor from which on a place counts as a corner
 _RIDGE = 1e-3
 _SOFT_PX = 0.15  # displacements beyond this count by their length, not by its square
+_EDGE = 0.6  # of net events in scaled units, averaged over 3 x 3 pixels: an edge has passed by a pixel
+_NEAR = 13  # pixels; side of the square about a passing edge that shows what lies there
+
+
+def weights_of_places(
+    voxels: Float[torch.Tensor, "t b c h w"], num_bins: int, unseen_weight: float
+) -> Float[torch.Tensor, "t b 1 h w"]:
+    """How much each place counts, window after window of a clip: 1 once an edge has passed near it, before that
+    `unseen_weight`.
+
+    A place that nothing has passed yet cannot be known. A network that is asked for it all the same does well to call
+    it grey, and learns to call grey what it has long not seen.
+    """
+    if unseen_weight == 1.0:
+        return torch.ones_like(voxels[:, :, :1])
+    # The sum so far is the change of brightness since the clip's start; noise of both signs cancels in it.
+    change = voxels[:, :, :num_bins].sum(dim=2).cumsum(dim=0)
+    edges = F.avg_pool2d(change, 3, stride=1, padding=1).abs() > _EDGE
+    near = F.max_pool2d(edges.to(change.dtype), _NEAR, stride=1, padding=_NEAR // 2)
+    seen = near.cummax(dim=0).values[:, :, None]
+    return unseen_weight + (1.0 - unseen_weight) * seen
 
 
 def image_loss(
-    predicted: Float[torch.Tensor, "*n h w"], target: Float[torch.Tensor, "*n h w"], gradient_weight: float
+    predicted: Float[torch.Tensor, "*n h w"],
+    target: Float[torch.Tensor, "*n h w"],
+    weight: Float[torch.Tensor, "*n h w"],
+    gradient_weight: float,
 ) -> Float[torch.Tensor, ""]:
-    """L1 error of the image, plus that of its differences between neighbours along rows and columns."""
+    """Weighted L1 error of the image, plus that of its differences between neighbours along rows and columns."""
     error = predicted - target
-    differences = error.diff(dim=-1).abs().mean() + error.diff(dim=-2).abs().mean()
-    return error.abs().mean() + gradient_weight * differences
+    along_rows = _mean(error.diff(dim=-1).abs(), weight[..., 1:])
+    along_columns = _mean(error.diff(dim=-2).abs(), weight[..., 1:, :])
+    return _mean(error.abs(), weight) + gradient_weight * (along_rows + along_columns)
+
+
+def _mean(values: torch.Tensor, weight: torch.Tensor) -> Float[torch.Tensor, ""]:
+    return (values * weight).sum() / weight.sum().clamp_min(1e-3)
 
 
 def displacement_loss(
-    predicted: Float[torch.Tensor, "*n h w"], target: Float[torch.Tensor, "*n h w"]
+    predicted: Float[torch.Tensor, "*n h w"],
+    target: Float[torch.Tensor, "*n h w"],
+    weight: Float[torch.Tensor, "*n h w"],
 ) -> Float[torch.Tensor, ""]:
-    """How far corners are displaced, pixels: the mean over the places whose surroundings hold a corner.
+    """How far corners are displaced, pixels: the weighted mean over the places whose surroundings hold a corner.
 
     The L1 error of an image is content with edges that all lag a little; a calibration is not. A pattern displaced by
     d gives the error -d . grad(target): solved by least squares over a window around each place (Lucas & Kanade 1981).
@@ -34,9 +65,10 @@ def displacement_loss(
     sums = F.avg_pool2d(torch.cat([gx * gx, gx * gy, gy * gy, gx * error, gy * error], dim=1), _WINDOW, stride=2)
     xx, xy, yy, ex, ey = sums.unbind(dim=1)
     smaller = 0.5 * (xx + yy) - (0.25 * (xx - yy) ** 2 + xy * xy + 1e-12).sqrt()
-    weight = smaller / (smaller + _ROUND)
+    cornered = smaller / (smaller + _ROUND)
+    places = F.avg_pool2d(weight.flatten(0, -3)[:, None, 1:-1, 1:-1], _WINDOW, stride=2)[:, 0]
     determinant = (xx + _RIDGE) * (yy + _RIDGE) - xy * xy
     dx = ((yy + _RIDGE) * ex - xy * ey) / determinant
     dy = ((xx + _RIDGE) * ey - xy * ex) / determinant
     size = _SOFT_PX * ((1.0 + (dx * dx + dy * dy) / _SOFT_PX**2).sqrt() - 1.0)
-    return (weight * size).sum() / weight.sum().clamp_min(1e-3)
+    return _mean(size, cornered * places)

@@ -109,3 +109,13 @@ def speed_profile(rng: np.random.Generator, windows: int, top_speed: float, samp
         distance = np.maximum(start - window, window - start - length)  # from the pause, in windows
         speed = speed * np.clip(distance / 0.5, 0.0, 1.0)
     return np.concatenate([[0.0], np.cumsum(speed) / samples])
+
+
+def lull(rng: np.random.Generator, travelled: Float[np.ndarray, " n"], samples: int) -> Float[np.ndarray, " n"]:
+    """Image motion so far, slowed to a fiftieth to a fifth for 10 to 40 windows that begin in its first half."""
+    windows = (len(travelled) - 1) / samples
+    start, length = rng.uniform(0.1, 0.5) * windows, rng.uniform(10, 40)
+    slowed = np.exp(rng.uniform(np.log(0.02), np.log(0.2)))
+    window = (np.arange(len(travelled) - 1) + 0.5) / samples
+    factor = np.interp(window, [start - 1.0, start, start + length, start + length + 1.0], [1.0, slowed, slowed, 1.0])
+    return np.concatenate([[0.0], np.cumsum(np.diff(travelled) * factor)])

@@ -15,9 +15,9 @@ class DataRecipe:
     board at all, the rest are AprilGrids with bits of `smallest_bit_px` pixels or more. Boards are tilted by up to
     `largest_tilt_deg`, windows last 10 ms to `longest_window_ms`. Scenes in which the board comes near to edge-on are
     kept only with `edge_on`. The fastest image motion of a sequence lies between `slowest_px` and `fastest_px` pixels
-    per window; the share `swinging` of the sequences moves as a hand does, slowly where it turns back. `scaling` of
-    the voxel grids and the moment of the window that its image is of, as `ReconstructionNetwork.scaling` and
-    `shown_at`.
+    per window; the share `swinging` of the sequences moves as a hand does, slowly where it turns back, and the share
+    `lulls` all but rests for a while. `scaling` of the voxel grids and the moment of the window that its image is of,
+    as `ReconstructionNetwork.scaling` and `shown_at`.
     """
 
     sequences: int = 300
@@ -33,6 +33,7 @@ class DataRecipe:
     slowest_px: float = 1.5
     fastest_px: float = 25.0
     swinging: float = 0.0
+    lulls: float = 0.0
     scaling: str = "window"
     shown_at: float = 1.0
     seed: int = 2026
@@ -66,7 +67,8 @@ class Recipe:
     """All of it, of a network of class `architecture`.
 
     `gradient_weight` multiplies the L1 error of the image's differences, and `displacement_weight` the displacement of
-    corners in pixels, beside the L1 error of the image. The learning rate is held, and falls to zero over the last
+    corners in pixels, beside the L1 error of the image. Places past which no edge has come since the clip's start count
+    by `unseen_weight`. The learning rate is held, and falls to zero over the last
     `falling_share` of the steps. With a `parent`, training starts from the weights that the parent's recipe gives.
     """
 
@@ -86,6 +88,7 @@ class Recipe:
     clip_norm: float = 1.0
     average_decay: float = 0.998
     displacement_weight: float = 0.0
+    unseen_weight: float = 1.0
     falling_share: float = 1.0
     precision: str = "bfloat16"
     parent: "Recipe | None" = None
@@ -184,6 +187,18 @@ PATTERNS_V4 = replace(
     parent=PATTERNS_V3,
     seed=6,
 )
+# What has passed is remembered while all but nothing moves: clips that rest for a while after they moved, and a loss
+# that asks for no place before its edge has come. From patterns_v4, on two CPU cores.
+PATTERNS_V5 = replace(
+    PATTERNS_V4,
+    data=replace(PATTERNS_V4.data, sequences=500, windows=80, slowest_px=1.0, lulls=0.5, seed=2031),
+    stages=(Stage(crop=96, windows=40, segments=2, batch=4, clips=2000),),
+    learning_rate=1e-3,
+    falling_share=1.0,
+    unseen_weight=0.05,
+    parent=PATTERNS_V4,
+    seed=9,
+)
 # FireNet (Scheerlinck et al. 2020) in the way it was meant: the world at large, images of the window's end.
 FIRENET_PICTURES = Recipe(
     data=DataRecipe(
@@ -198,5 +213,6 @@ RECIPES = {
     "patterns_v1": PATTERNS_V1,
     "patterns_v3": PATTERNS_V3,
     "patterns_v4": PATTERNS_V4,
+    "patterns_v5": PATTERNS_V5,
     "firenet_pictures": FIRENET_PICTURES,
 }

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxcal.simulation.event_sensor import EventSensor, EventSensorConfig
-from reconstruction.training.motion import Path, View, apply_homography, speed_profile
+from reconstruction.training.motion import Path, View, apply_homography, lull, speed_profile
 from reconstruction.training.patterns import Pattern, aprilgrid, charuco, checkerboard, circle_grid, picture
 from reconstruction.training.recipe import DataRecipe
 
@@ -98,7 +98,9 @@ def _any_training_scene(rng: np.random.Generator, recipe: DataRecipe) -> Scene:
     top_speed = float(np.exp(rng.uniform(np.log(recipe.slowest_px), np.log(recipe.fastest_px))))
     scene = _moving(rng, pattern, view, recipe.windows, top_speed=top_speed, longest_ms=recipe.longest_window_ms)
     if recipe.swinging and rng.random() < recipe.swinging:
-        return replace(scene, travelled=scene.path.swing(recipe.windows, top_speed, scene.samples))
+        scene = replace(scene, travelled=scene.path.swing(recipe.windows, top_speed, scene.samples))
+    if recipe.lulls and rng.random() < recipe.lulls:
+        scene = replace(scene, travelled=lull(rng, scene.travelled, scene.samples))
     return scene
 
 

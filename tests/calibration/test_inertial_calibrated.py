@@ -22,8 +22,8 @@ BASIS = jnp.linalg.qr(jnp.stack([GRAVITY, jnp.array([1.0, 0.2, 0.1]), jnp.array(
 
 
 def random_windows(order: int, seed: int) -> tuple[jax.Array, ...]:
-    """Control rotations (B, k, 3, 3) and positions (B, k, 3), biases at the ends (B, 2, 6), samples (B, S, ...), inverse
-    sigma (6,); in brisk motion."""
+    """Control rotations (B, k, 3, 3) and positions (B, k, 3), biases at the ends (B, 2, 6), samples (B, S, ...), and
+    inverse sigma (6,), in brisk motion."""
     rng = np.random.default_rng(seed)
     first = rng.normal(size=(INTERVALS, 1, 3))
     turns = np.concatenate([first, rng.normal(scale=0.2, size=(INTERVALS, order - 1, 3))], axis=1)

@@ -14,8 +14,8 @@ from reconstruction.networks import ReconstructionNetwork
 from reconstruction.training import loop
 from reconstruction.training.data import Dataset, load_or_generate
 from reconstruction.training.evaluate import CornerErrors, find_corners
-from reconstruction.training.losses import displacement_loss, image_loss
-from reconstruction.training.motion import apply_homography, speed_profile
+from reconstruction.training.losses import displacement_loss, image_loss, weights_of_places
+from reconstruction.training.motion import apply_homography, lull, speed_profile
 from reconstruction.training.recipe import DataRecipe, Recipe, Stage, fingerprint
 from reconstruction.training.sequences import BLACK, WHITE, evaluation_scene, training_scene, windows
 
@@ -94,7 +94,8 @@ def test_training_reduces_the_loss_on_what_it_sees(tiny_dataset: Dataset, tmp_pa
 
     def loss(network: ReconstructionNetwork) -> float:
         with torch.no_grad():
-            return loop._segment_loss(network, voxels, targets, None, 2, recipe)[0].item()
+            weights = torch.ones_like(targets)
+            return loop._segment_loss(network, voxels, targets, weights, None, 2, recipe)[0].item()
 
     before = loss(loop._start(recipe).network)
     trained = loop.train(recipe, tiny_dataset, tmp_path / "run.pt")
@@ -173,12 +174,13 @@ def test_a_finished_training_is_taken_from_its_checkpoint(tiny_dataset: Dataset,
 def test_replayed_steps_are_the_steps_themselves(tiny_dataset: Dataset):
     recipe = replace(TINY, precision="float32")
     voxels, targets = (tensor.cuda() for tensor in tiny_dataset.clip(np.random.default_rng(0), TINY.stages[0]))
+    weights = torch.rand_like(targets)
     gradients = []
     for make in (loop._eager, loop._Replayed):
         network = loop._start(recipe, device="cuda").network
         segment = make(network, recipe)
-        _, state = segment(voxels, targets, None, 2)
-        segment(voxels, targets, state, 0)
+        _, state = segment(voxels, targets, weights, None, 2)
+        segment(voxels, targets, weights, state, 0)
         gradients.append([parameter.grad for parameter in network.parameters()])
     for one, other in zip(*gradients, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
@@ -226,9 +228,10 @@ def test_fingerprint_changes_with_any_setting():
 def test_image_loss_is_zero_for_the_truth_and_counts_edges():
     target = torch.zeros(1, 4, 4)
     offset, stripes = torch.full((1, 4, 4), 0.1), 0.1 * (torch.arange(4) % 2 * 2.0 - 1).expand(1, 4, 4)
-    assert image_loss(target, target, 0.5).item() == 0.0
-    assert image_loss(target + offset, target, 0.5).item() == pytest.approx(0.1)
-    assert image_loss(target + stripes, target, 0.5).item() == pytest.approx(0.1 + 0.5 * 0.2)
+    weight = torch.ones_like(target)
+    assert image_loss(target, target, weight, 0.5).item() == 0.0
+    assert image_loss(target + offset, target, weight, 0.5).item() == pytest.approx(0.1)
+    assert image_loss(target + stripes, target, weight, 0.5).item() == pytest.approx(0.1 + 0.5 * 0.2)
 
 
 @settings(deadline=None, max_examples=20)
@@ -246,12 +249,56 @@ def test_displacement_loss_measures_how_far_a_board_is_displaced(dx: float, dy: 
     squared = (dx * dx + dy * dy) / 0.15**2
     expected = 0.15 * (np.sqrt(1.0 + squared) - 1.0)
     # A fifth of the lens' blur is where the first order in the displacement ends.
-    assert displacement_loss(shown((dx, dy)), shown((0.0, 0.0))).item() == pytest.approx(expected, rel=0.2, abs=1e-3)
+    loss = displacement_loss(shown((dx, dy)), shown((0.0, 0.0)), torch.ones(1, 60, 60))
+    assert loss.item() == pytest.approx(expected, rel=0.2, abs=1e-3)
 
 
 def test_displacement_loss_does_not_mind_wrong_grey_levels_without_edges():
     target = torch.zeros(1, 30, 30)
-    assert displacement_loss(target + 0.3, target).item() == 0.0
+    assert displacement_loss(target + 0.3, target, torch.ones_like(target)).item() == 0.0
+
+
+def test_places_of_no_weight_do_not_count():
+    board = torch.from_numpy(np.kron(np.indices((4, 8)).sum(axis=0) % 2, np.ones((10, 10))).astype(np.float32))[None]
+    wrong = board.clone()
+    wrong[..., 40:] = 1.0 - torch.roll(board, 2, dims=-1)[..., 40:]
+    weight = torch.zeros_like(board)
+    weight[..., :40] = 1.0
+    assert image_loss(wrong, board, weight, 0.5).item() == 0.0
+    assert displacement_loss(wrong[..., :30], board[..., :30], weight[..., :30]).item() == 0.0
+    everywhere = torch.ones_like(board)
+    assert image_loss(wrong, board, everywhere, 0.5).item() > 0.1
+    assert displacement_loss(wrong, board, everywhere).item() > displacement_loss(wrong, board, weight).item()
+
+
+def test_places_count_once_an_edge_has_passed_near_them():
+    voxels = torch.zeros(6, 1, 4, 40, 60)
+    voxels += 0.05 * torch.randn(voxels.shape, generator=torch.Generator().manual_seed(1))  # noise of both signs
+    voxels[2, 0, 1, :, 10:12] = 1.0  # an upright edge moves by two pixels, in the third and fourth window
+    voxels[3, 0, 2, :, 12:14] = 1.0
+    weights = weights_of_places(voxels, 3, 0.1)
+    assert weights.shape == (6, 1, 1, 40, 60)
+    assert (weights[:2] == 0.1).all()
+    assert (weights[2:, ..., 6:16] == 1.0).all()
+    assert (weights[..., 25:] == 0.1).all()
+    assert (weights.diff(dim=0) >= 0.0).all()  # what has been seen stays so
+    assert (weights_of_places(voxels, 3, 1.0) == 1.0).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), windows_count=st.integers(20, 90))
+def test_a_lull_slows_down_what_comes_in_it_and_nothing_before(seed: int, windows_count: int):
+    travelled = np.linspace(0.0, 5.0 * windows_count, 16 * windows_count + 1)
+    slowed = lull(np.random.default_rng(seed), travelled, 16)
+    speed = 16 * np.diff(slowed)
+    assert slowed[0] == 0.0
+    assert slowed.shape == travelled.shape
+    assert 5.0 * 0.02 * (1 - 1e-9) <= speed.min() <= 5.0 * 0.2 * (1 + 1e-9)
+    assert speed.max() == pytest.approx(5.0)
+    assert (speed < 2.0).sum() >= 16 * 9
+    first = int(np.argmax(speed < 5.0 - 1e-9))
+    assert 0.1 * windows_count - 1.0 - 1e-9 <= first / 16 <= 0.5 * windows_count
+    np.testing.assert_allclose(slowed[:first], travelled[:first])
 
 
 @settings(deadline=None, max_examples=20)
