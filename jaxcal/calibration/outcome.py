@@ -8,8 +8,9 @@ import equinox as eqx
 import numpy as np
 
 from jaxcal.calibration import observability, outliers, uncertainty
-from jaxcal.calibration.assemble import CameraFrames, split_groups, stack_weights
+from jaxcal.calibration.assemble import CameraFrames, split_groups
 from jaxcal.calibration.checks import versions
+from jaxcal.calibration.left_out import Wandering, corner_weights, equations_with, wandering
 from jaxcal.calibration.lens_basis import to_parameters
 from jaxcal.calibration.problem import camera_poses
 from jaxcal.calibration.redundancy import Redundancy
@@ -21,13 +22,13 @@ from jaxcal.calibration.target_shape import target_points
 from jaxcal.calibration.view_noise import LEAN, share_of_place
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
-from jaxcal.estimation import BlockArrow, on_device, solve
+from jaxcal.estimation import BlockArrow, on_device
 from jaxcal.results import Calibration, CameraCalibration, ImuCalibration, TargetShape
 from jaxcal.targets import Target
 
 # Corners of any video, and of frames made of events, hang together somewhat, and sigmas allow for it. Where they are
 # more than three times as large for it, something is amiss.
-_WORTH_SAYING = 9.0
+_WORTH_SAYING = 25.0
 
 
 def chain_covariance_and_sentences(
@@ -46,20 +47,44 @@ def chain_covariance_and_sentences(
     basis = to_parameters(fit.problem.basis, layout)
     known_as = (np.asarray(fit.problem.free), uncertainty.labels_of(names, models, layout), basis)
     noises = _score_noises(fit, cameras)
+    astray = _wanderings(fit, cameras, noises)
     # Views that repeat each other's errors got relative weights, which claim too much by `inflation` in any case.
-    effects = [
-        max(1.0 if noise is None else noise.effect, known.inflation)
-        for noise, known in zip(noises, fit.redundancy, strict=True)
-    ]
-    as_weighted = max(effects) == 1.0 and all((effect == 1.0).all() for effect in imu_effects)
-    equations = fit.result.equations if as_weighted else _equations_of_less(fit, cameras, effects, imu_effects)
-    covariance, chain, sentences = uncertainty.shared_covariance(equations, *known_as)
-    if any(noise is not None for noise in noises):
+    inflations = [known.inflation for known in fit.redundancy]
+    causes = zip(noises, astray, inflations, strict=True)
+    effects = [max(inflation, _effect(found or noise)) for noise, found, inflation in causes]
+    # What leads a camera astray is added as it was seen; the others' corners count less in the equations.
+    counted = [effect if found is None else i for effect, found, i in zip(effects, astray, inflations, strict=True)]
+    covariance, chain, sentences = uncertainty.shared_covariance(
+        _equations_of_less(fit, cameras, counted, imu_effects), *known_as
+    )
+    if counted != effects:
+        less = _equations_of_less(fit, cameras, effects, imu_effects)
+        chain = uncertainty.shared_covariance(less, *known_as)[1]
+    to_named = np.eye(layout.size) if basis is None else basis
+    for found, inflation in zip(astray, inflations, strict=True):
+        if found is not None:
+            covariance = covariance + to_named @ found.beyond(inflation) @ to_named.T
+    lenses = [None if found is not None else noise for noise, found in zip(noises, astray, strict=True)]
+    if any(noise is not None for noise in lenses):
         # How the optimum answers to a score is a matter of the weights that it was found with.
-        response = covariance if as_weighted else uncertainty.shared_covariance(fit.result.equations, *known_as)[0]
-        covariance = covariance + _beyond_the_mean(response, layout, noises, effects)
+        response = uncertainty.shared_covariance(fit.result.equations, *known_as)[0]
+        covariance = covariance + _beyond_the_mean(response, layout, lenses, effects)
     sentences += sentences_on_errors(names, fit.redundancy, effects)
     return covariance, chain, sentences
+
+
+def _effect(found: ScoreNoise | Wandering | None) -> float:
+    return 1.0 if found is None else found.effect
+
+
+def _wanderings(
+    fit: RobustFit, cameras: Sequence[CameraFrames], noises: Sequence[ScoreNoise | None]
+) -> list[Wandering | None]:
+    """What those cameras do to the others whose corners hang together. A camera by itself has its poses from its own
+    corners: its lens is all that they lead astray, and the score of that says how far."""
+    if fit.problem.layout.num_cameras == 1 and fit.problem.imu is None:
+        return [None]
+    return [None if noise is None else wandering(fit, cameras, c) for c, noise in enumerate(noises)]
 
 
 def _beyond_the_mean(
@@ -103,7 +128,7 @@ def _score_noises(fit: RobustFit, cameras: Sequence[CameraFrames]) -> list[Score
     poses = split_groups(layout, cameras, [np.asarray(part) for part in camera_poses(problem, state)])
     points = np.asarray(target_points(problem.geometry, state.target))
     models = [camera_model_of(state, layout, problem.templates, c) for c in range(layout.num_cameras)]
-    parts = zip(models, poses, fit.errors, _corner_weights(fit, cameras), strict=True)
+    parts = zip(models, poses, fit.errors, corner_weights(fit, cameras), strict=True)
     return [score_noise(model, points, *own) for model, *own in parts]
 
 
@@ -111,18 +136,15 @@ def _equations_of_less(
     fit: RobustFit, cameras: Sequence[CameraFrames], effects: Sequence[float], imu_effects: Sequence[np.ndarray]
 ) -> BlockArrow:
     """The equations at the optimum with each camera's corners and each IMU's samples counting as much as they tell."""
-    weights = [own / effect for own, effect in zip(_corner_weights(fit, cameras), effects, strict=True)]
-    stacked = stack_weights(fit.problem.layout, cameras, weights)
-    problem = eqx.tree_at(lambda p: [data.weight for data in p.corners], fit.problem, list(stacked))
-    if problem.imu is not None:
-        samples = zip(problem.imu.samples, imu_effects, strict=True)
+    if max(effects) == 1.0 and all((effect == 1.0).all() for effect in imu_effects):
+        return fit.result.equations
+    if fit.problem.imu is not None:
+        samples = zip(fit.problem.imu.samples, imu_effects, strict=True)
         inverse = [own.inverse_sigma / on_device(np.sqrt(np.repeat(effect, 3))) for own, effect in samples]
-        problem = eqx.tree_at(lambda p: [own.inverse_sigma for own in p.imu.samples], problem, inverse)
-    return solve(problem, fit.state, max_steps=1).equations  # those that the first step would solve
-
-
-def _corner_weights(fit: RobustFit, cameras: Sequence[CameraFrames]) -> list[np.ndarray]:
-    return split_groups(fit.problem.layout, cameras, [np.asarray(data.weight) for data in fit.problem.corners])
+        problem = eqx.tree_at(lambda p: [own.inverse_sigma for own in p.imu.samples], fit.problem, inverse)
+        fit = dataclasses.replace(fit, problem=problem)
+    weights = [own / effect for own, effect in zip(corner_weights(fit, cameras), effects, strict=True)]
+    return equations_with(fit, cameras, weights)
 
 
 # What to try where a lens is too lean for its corners.

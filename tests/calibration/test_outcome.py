@@ -11,9 +11,9 @@ ALIKE = Redundancy(np.ones(3), 2.0, 0.4)
 
 def test_what_sigmas_allow_for_is_said_where_it_is_much() -> None:
     names = ["events", "blurred", "clean"]
-    (sentence,) = sentences_on_errors(names, [INDEPENDENT] * 3, [4.0, 16.0, 1.0])
+    (sentence,) = sentences_on_errors(names, [INDEPENDENT] * 3, [9.0, 36.0, 1.0])
     assert sentence.startswith("blurred: ")
-    assert "4.0 times" in sentence
+    assert "6.0 times" in sentence
 
 
 def test_views_that_count_less_are_always_named() -> None:
