@@ -17,7 +17,7 @@ from jaxcal.recording.windows import WindowPlan
 AUTOMATIC = "auto"
 
 # Corners in reconstructed frames trail behind the events, and no calibration can tell that lag from a time offset. With
-# the shipped network it was 0 to 0.3 ms in simulated recordings (models/patterns_v5.md,
+# the shipped network it was 0 to 0.3 ms in simulated recordings (models/patterns_v6.md,
 # experiments/paper_table1_detection.py, experiments/run_multicam.py); this is the 1-sigma that is allowed for it, s.
 LAG_SIGMA_S = 3e-4
 

@@ -14,7 +14,7 @@ from jaxcal.errors import CalibrationError
 from reconstruction.networks import ARCHITECTURES, ReconstructionNetwork
 from reconstruction.official import read_official
 
-DEFAULT_NETWORK = "patterns_v5"
+DEFAULT_NETWORK = "patterns_v6"
 
 # `models/` lies beside this package, in a checkout as well as in an installed wheel; found from here, not by the
 # import system, since a user's own folder called "models" would win there.

@@ -172,6 +172,8 @@ def _loss(recipe: Recipe) -> str:
     text = f"L1 of the image + {recipe.gradient_weight} x L1 of its differences"
     if recipe.displacement_weight > 0:
         text += f" + {recipe.displacement_weight} x displacement of corners (px)"
+    if recipe.shared_weight > 0:
+        text += f"\n+ {recipe.shared_weight} x displacement shared by the corners of an image, and of a clip (px)"
     if recipe.unseen_weight < 1.0:
         text += f";\nplaces past which no edge has come yet count {recipe.unseen_weight:g}"
     return text

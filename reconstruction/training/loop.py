@@ -19,7 +19,7 @@ from jaxcal.progress import Progress, no_progress
 from reconstruction.networks import ARCHITECTURES, ReconstructionNetwork
 from reconstruction.networks.base import State
 from reconstruction.training.data import Dataset
-from reconstruction.training.losses import displacement_loss, image_loss, weights_of_places
+from reconstruction.training.losses import displacement_losses, image_loss, weights_of_places
 from reconstruction.training.recipe import Recipe, Stage, fingerprint
 
 HISTORY_STEPS = 50
@@ -236,7 +236,8 @@ def _segment_loss(
     targets, weights = targets[warm_up:], weights[warm_up:]
     loss = image_loss(predicted, targets, weights, recipe.gradient_weight)
     if recipe.displacement_weight > 0:
-        loss = loss + recipe.displacement_weight * displacement_loss(predicted, targets, weights)
+        each, shared = displacement_losses(predicted, targets, weights)
+        loss = loss + recipe.displacement_weight * each + recipe.shared_weight * shared
     return loss, state
 
 

@@ -14,7 +14,7 @@ from reconstruction.networks import ReconstructionNetwork
 from reconstruction.training import loop
 from reconstruction.training.data import Dataset, load_or_generate
 from reconstruction.training.evaluate import CornerErrors, find_corners
-from reconstruction.training.losses import displacement_loss, image_loss, weights_of_places
+from reconstruction.training.losses import displacement_losses, image_loss, weights_of_places
 from reconstruction.training.motion import apply_homography, lull, speed_profile
 from reconstruction.training.recipe import DataRecipe, Recipe, Stage, fingerprint
 from reconstruction.training.sequences import BLACK, WHITE, evaluation_scene, training_scene, windows
@@ -234,41 +234,66 @@ def test_image_loss_is_zero_for_the_truth_and_counts_edges():
     assert image_loss(target + stripes, target, weight, 0.5).item() == pytest.approx(0.1 + 0.5 * 0.2)
 
 
+def shifted_board(dx: float, dy: float) -> torch.Tensor:
+    """(60, 60): a checkerboard before a lens, displaced by (dx, dy) pixels."""
+    board = np.kron(np.indices((6, 6)).sum(axis=0) % 2, np.ones((80, 80))).astype(np.float32)
+    shift = np.array([[1, 0, 8 * dx], [0, 1, 8 * dy]])
+    moved = cv2.warpAffine(board, shift, (480, 480), borderMode=cv2.BORDER_REPLICATE)
+    blurred = cv2.GaussianBlur(moved, (0, 0), 5.6)
+    return torch.from_numpy(cv2.resize(blurred, (60, 60), interpolation=cv2.INTER_AREA))
+
+
+def displacements_of(images: list[list[torch.Tensor]]) -> tuple[float, float]:
+    """Of clips of boards, by windows and clips, that should show the board where it is: each corner's, and shared."""
+    predicted = torch.stack([torch.stack(row)[:, None] for row in images])
+    target = shifted_board(0.0, 0.0).expand_as(predicted)
+    each, shared = displacement_losses(predicted, target, torch.ones_like(predicted))
+    return each.item(), shared.item()
+
+
 @settings(deadline=None, max_examples=20)
 @given(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
-def test_displacement_loss_measures_how_far_a_board_is_displaced(dx: float, dy: float):
-    board = np.kron(np.indices((6, 6)).sum(axis=0) % 2, np.ones((80, 80))).astype(np.float32)
-
-    def shown(shift: tuple[float, float]) -> torch.Tensor:
-        moved = cv2.warpAffine(
-            board, np.array([[1, 0, 8 * shift[0]], [0, 1, 8 * shift[1]]]), (480, 480), borderMode=cv2.BORDER_REPLICATE
-        )
-        blurred = cv2.GaussianBlur(moved, (0, 0), 5.6)
-        return torch.from_numpy(cv2.resize(blurred, (60, 60), interpolation=cv2.INTER_AREA))[None]
-
-    squared = (dx * dx + dy * dy) / 0.15**2
-    expected = 0.15 * (np.sqrt(1.0 + squared) - 1.0)
-    # A fifth of the lens' blur is where the first order in the displacement ends.
-    loss = displacement_loss(shown((dx, dy)), shown((0.0, 0.0)), torch.ones(1, 60, 60))
-    assert loss.item() == pytest.approx(expected, rel=0.2, abs=1e-3)
+def test_displacement_losses_measure_how_far_a_board_is_displaced(dx: float, dy: float):
+    each, shared = displacements_of([[shifted_board(dx, dy)]])
+    # A fifth of the lens' blur is where the first order in the displacement ends; the bounds of what a place may say
+    # shorten what all share.
+    size = np.hypot(dx, dy)
+    assert each == pytest.approx(0.15 * (np.hypot(1.0, size / 0.15) - 1.0), rel=0.2, abs=1e-3)
+    bounded = size / np.hypot(1.0, size / 0.15)
+    assert shared == pytest.approx(2 * 0.02 * (np.hypot(1.0, bounded / 0.02) - 1.0), rel=0.2, abs=1e-3)
 
 
-def test_displacement_loss_does_not_mind_wrong_grey_levels_without_edges():
-    target = torch.zeros(1, 30, 30)
-    assert displacement_loss(target + 0.3, target, torch.ones_like(target)).item() == 0.0
+def test_displacements_that_cancel_over_an_image_or_a_clip_are_not_shared():
+    halves = torch.cat([shifted_board(0.1, 0.0)[:, :30], shifted_board(-0.1, 0.0)[:, 30:]], dim=1)
+    together, alternating = shifted_board(0.1, 0.0), [[shifted_board(0.1, 0.0)], [shifted_board(-0.1, 0.0)]]
+    each, shared = displacements_of([[halves], [halves]])
+    each_together, shared_together = displacements_of([[together], [together]])
+    _, shared_in_turns = displacements_of(alternating)
+    assert each == pytest.approx(each_together, rel=0.2)
+    assert shared < 0.05 * shared_together
+    assert shared_in_turns == pytest.approx(0.5 * shared_together, rel=0.1)  # in every image, over no clip
+
+
+def test_displacement_losses_do_not_mind_wrong_grey_levels_without_edges():
+    target = torch.zeros(2, 1, 1, 30, 30)
+    each, shared = displacement_losses(target + 0.3, target, torch.ones_like(target))
+    assert (each.item(), shared.item()) == (0.0, 0.0)
 
 
 def test_places_of_no_weight_do_not_count():
-    board = torch.from_numpy(np.kron(np.indices((4, 8)).sum(axis=0) % 2, np.ones((10, 10))).astype(np.float32))[None]
+    board = torch.from_numpy(np.kron(np.indices((4, 8)).sum(axis=0) % 2, np.ones((10, 10))).astype(np.float32))
+    board = board.expand(1, 1, 1, *board.shape)
     wrong = board.clone()
     wrong[..., 40:] = 1.0 - torch.roll(board, 2, dims=-1)[..., 40:]
     weight = torch.zeros_like(board)
     weight[..., :40] = 1.0
     assert image_loss(wrong, board, weight, 0.5).item() == 0.0
-    assert displacement_loss(wrong[..., :30], board[..., :30], weight[..., :30]).item() == 0.0
+    right = slice(0, 30)
+    each, shared = displacement_losses(wrong[..., right], board[..., right], weight[..., right])
+    assert (each.item(), shared.item()) == (0.0, 0.0)
     everywhere = torch.ones_like(board)
     assert image_loss(wrong, board, everywhere, 0.5).item() > 0.1
-    assert displacement_loss(wrong, board, everywhere).item() > displacement_loss(wrong, board, weight).item()
+    assert displacement_losses(wrong, board, everywhere)[0] > displacement_losses(wrong, board, weight)[0]
 
 
 def test_places_count_once_an_edge_has_passed_near_them():
