@@ -47,34 +47,26 @@ def chain_covariance_and_sentences(
     basis = to_parameters(fit.problem.basis, layout)
     known_as = (np.asarray(fit.problem.free), uncertainty.labels_of(names, models, layout), basis)
     noises = _score_noises(fit, cameras)
-    astray = _wanderings(fit, cameras, noises)
     # Views that repeat each other's errors got relative weights, which claim too much by `inflation` in any case.
-    inflations = [known.inflation for known in fit.redundancy]
-    causes = zip(noises, astray, inflations, strict=True)
-    effects = [max(inflation, _effect(found or noise)) for noise, found, inflation in causes]
-    # What leads a camera astray is added as it was seen; the others' corners count less in the equations.
-    counted = [effect if found is None else i for effect, found, i in zip(effects, astray, inflations, strict=True)]
-    covariance, chain, sentences = uncertainty.shared_covariance(
-        _equations_of_less(fit, cameras, counted, imu_effects), *known_as
-    )
-    if counted != effects:
-        less = _equations_of_less(fit, cameras, effects, imu_effects)
-        chain = uncertainty.shared_covariance(less, *known_as)[1]
+    effects = [
+        max(1.0 if noise is None else noise.effect, known.inflation)
+        for noise, known in zip(noises, fit.redundancy, strict=True)
+    ]
+    equations = _equations_of_less(fit, cameras, effects, imu_effects)
+    covariance, chain, sentences = uncertainty.shared_covariance(equations, *known_as)
+    astray = _wanderings(fit, cameras, noises)
     to_named = np.eye(layout.size) if basis is None else basis
-    for found, inflation in zip(astray, inflations, strict=True):
+    for found, effect in zip(astray, effects, strict=True):
         if found is not None:
-            covariance = covariance + to_named @ found.beyond(inflation) @ to_named.T
+            covariance = covariance + to_named @ found.beyond(effect) @ to_named.T
     lenses = [None if found is not None else noise for noise, found in zip(noises, astray, strict=True)]
     if any(noise is not None for noise in lenses):
         # How the optimum answers to a score is a matter of the weights that it was found with.
         response = uncertainty.shared_covariance(fit.result.equations, *known_as)[0]
         covariance = covariance + _beyond_the_mean(response, layout, lenses, effects)
-    sentences += sentences_on_errors(names, fit.redundancy, effects)
+    of_all = [max(e, 1.0 if found is None else found.effect) for e, found in zip(effects, astray, strict=True)]
+    sentences += sentences_on_errors(names, fit.redundancy, of_all)
     return covariance, chain, sentences
-
-
-def _effect(found: ScoreNoise | Wandering | None) -> float:
-    return 1.0 if found is None else found.effect
 
 
 def _wanderings(
