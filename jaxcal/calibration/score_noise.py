@@ -31,6 +31,7 @@ _STRETCHES = 12
 _LEAST_LEFT = 0.1
 _FEWEST_CORNERS = 6
 _AT_ONCE = 2_000_000  # derivatives, for memory
+_SAME_POSE = 1e-12  # of the information on a pose: corners in a line leave a turn about it open
 
 
 @dataclass(frozen=True)
@@ -118,16 +119,21 @@ def _scores(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The score (F, P) of the lens's parameters `chosen` in each view, with the view's pose free, and its covariance
     (F, P, P) were errors independent. The other arguments as for `score_noise`."""
-    root = np.sqrt(weights)[..., None]
-    seen = np.where(root > 0, np.einsum("fij,nj->fni", poses[:, :3, :3], points) + poses[:, None, :3, 3], 1.0)
-    by_lens, by_pose = _derivatives(model, chosen, seen)
-    by_lens, by_pose, error = (
-        (np.where(root[..., None] > 0, part, 0.0) * root[..., None]).reshape(len(poses), -1, part.shape[-1])
-        for part in (by_lens, by_pose, errors[..., None])
-    )
-    basis, _ = np.linalg.qr(by_pose)
-    by_lens, error = (part - basis @ (basis.swapaxes(1, 2) @ part) for part in (by_lens, error))
-    return (by_lens.swapaxes(1, 2) @ error)[..., 0], by_lens.swapaxes(1, 2) @ by_lens
+    root = np.sqrt(weights)
+    seen = np.einsum("fij,nj->fin", poses[:, :3, :3], points) + poses[:, :3, 3, None]
+    by_lens, by_pose = _derivatives(model, chosen, np.where(root[:, None] > 0, seen, 1.0))
+    columns = np.concatenate([by_lens, errors.swapaxes(1, 2)[:, None], by_pose], axis=1)
+    columns *= root[:, None, None]
+    columns[np.broadcast_to(root[:, None, None] == 0, columns.shape)] = 0.0  # where nothing was seen may be anything
+    columns = columns.reshape(*columns.shape[:2], -1)
+    products = columns @ columns.swapaxes(1, 2)
+    # The pose eliminated: what is left of lens and error is what no pose makes up for.
+    size = columns.shape[1] - 6
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2)[:, size:], 1e-300))
+    of_pose = products[:, size:, size:] * scale[:, :, None] * scale[:, None, :] + _SAME_POSE * np.eye(6)
+    with_pose = products[:, :size, size:] * scale[:, None, :]
+    left = products[:, :size, :size] - with_pose @ np.linalg.solve(of_pose, with_pose.swapaxes(1, 2))
+    return left[:, :-1, -1], left[:, :-1, :-1]
 
 
 def _beyond_chance(scores: np.ndarray, expected: np.ndarray) -> bool:
@@ -154,12 +160,13 @@ def _jackknife(scores: np.ndarray, expected: np.ndarray) -> np.ndarray:
 
 
 def _derivatives(model: CameraModel, chosen: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of the pixels of points (F, N, 3) in the camera's frame by the lens (F, N, 2, P) and by the pose
-    (F, N, 2, 6), rotation first; zeros where a point cannot be projected."""
+    """Derivatives of the pixels of points (F, 3, N) in the camera's frame by the lens (F, P, 2, N) and by the pose
+    (F, 6, 2, N), rotation first; zeros where a point cannot be projected."""
     parameters = np.asarray(model.parameters)
-    found = ModelLens(model).project(parameters[None], seen.swapaxes(-1, -2)[None], True)
+    found = ModelLens(model).project(parameters[None], seen[None], True)
     assert found.by_lens is not None
-    by_lens = np.transpose(found.by_lens[0][:, chosen], (0, 3, 2, 1))
-    by_point = np.transpose(found.by_point[0], (0, 3, 1, 2))
-    by_turn = np.cross(seen[..., None, :], by_point)  # a turn w moves a point by w x point
-    return by_lens, np.concatenate([by_turn, by_point], axis=-1)
+    by_point = found.by_point[0].swapaxes(1, 2)
+    x, y, z = seen[:, :, None].swapaxes(0, 1)
+    by_x, by_y, by_z = by_point.swapaxes(0, 1)
+    by_turn = [y * by_z - z * by_y, z * by_x - x * by_z, x * by_y - y * by_x]  # a turn w moves a point by w x point
+    return found.by_lens[0][:, chosen], np.concatenate([np.stack(by_turn, axis=1), by_point], axis=1)

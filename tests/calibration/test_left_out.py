@@ -49,11 +49,11 @@ def off_by(rig: SimulatedRig, found: Calibration) -> np.ndarray:
 @pytest.mark.parametrize("with_imu", [True, False])
 def test_a_camera_whose_images_err_as_a_whole_is_as_far_off_as_its_sigma_says(with_imu: bool) -> None:
     off = []
-    for seed in range(5):
+    for seed in range(4 if with_imu else 6):
         rig, rng = two_cameras(seed), np.random.default_rng([seed, 77])
         steady, shaking = (simulate_detections(rig, c, NOISE_PX) for c in range(2))
         off.append(off_by(rig, calibrated(rig, [steady, wobbling(shaking, rng, 0.1, 0.6)], with_imu=with_imu)))
-    # 15 errors, of which some hang together: their root mean square scatters by a quarter.
+    # 12 or 18 errors, of which some hang together: their root mean square scatters by a quarter.
     assert 0.5 < np.sqrt(np.mean(np.square(off))) < 1.5
 
 
