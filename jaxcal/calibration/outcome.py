@@ -27,7 +27,7 @@ from jaxcal.results import Calibration, CameraCalibration, ImuCalibration, Targe
 from jaxcal.targets import Target
 
 # Corners of any video, and of frames made of events, hang together somewhat, and sigmas allow for it. Where they are
-# more than three times as large for it, something is amiss.
+# more than five times as large for it, something is amiss.
 _WORTH_SAYING = 25.0
 
 
