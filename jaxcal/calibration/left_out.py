@@ -18,16 +18,13 @@ from jaxtyping import Array, Float
 
 from jaxcal.calibration.assemble import CameraFrames, split_groups, stack_weights
 from jaxcal.calibration.robust import RobustFit
-from jaxcal.calibration.uncertainty import shared_information
+from jaxcal.calibration.score_noise import LEAST_LEFT, STRETCHES
+from jaxcal.calibration.uncertainty import UNOBSERVED, shared_information
 from jaxcal.estimation import BlockArrow, factorise, single_threaded_blas, solve
 from jaxcal.programs import stored_jit
 
-_STRETCHES = 12
 # Directions of which a camera tells less than this share are others' to tell.
 _LEAST_SHARE = 0.1
-# A direction that one stretch alone tells is not known without it; its step is held to the inverse of this share.
-_LEAST_LEFT = 0.1
-_UNOBSERVED = 1e-11  # as for the covariance
 # Of a camera's weights, to see how much it tells; and of the diagonal, which holds no determined direction back.
 _LITTLE, _HARDLY_DAMPED = 1e-3, 1e-12
 
@@ -59,7 +56,7 @@ def wandering(fit: RobustFit, cameras: Sequence[CameraFrames], camera: int) -> W
     """
     free = np.flatnonzero(np.asarray(fit.problem.free))
     known, directions = shared_information(fit.result.equations, np.asarray(fit.problem.free))
-    told = known > _UNOBSERVED
+    told = known > UNOBSERVED
     whitened = directions[:, told] / np.sqrt(known[told])
 
     def without(part: slice | np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
@@ -76,12 +73,13 @@ def wandering(fit: RobustFit, cameras: Sequence[CameraFrames], camera: int) -> W
         return None
     axes, root = axes[:, some], np.sqrt(share[some])
     moved, expected = [], np.zeros((len(root), len(root)))
-    for stretch in np.array_split(np.arange(len(cameras[camera].frames)), _STRETCHES):
+    for stretch in np.array_split(np.arange(len(cameras[camera].frames)), STRETCHES):
         left, gradient = without(stretch, 1.0)
         values, vectors = np.linalg.eigh(left)
         along = axes.T @ vectors
-        # The covariance of the gradient is left (1 - left): independent corners make it (1 - left) of its root.
-        known_without = np.maximum(values, _LEAST_LEFT)
+        # With independent corners the gradient's covariance is left (1 - left). Over the root of what is left, it is
+        # 1 - left: what the stretch tells.
+        known_without = np.maximum(values, LEAST_LEFT)
         moved.append(along @ (vectors.T @ gradient / np.sqrt(known_without)))
         expected += (along * (np.maximum(values, 0.0) / known_without * (1.0 - values))) @ along.T
     usual, turned = np.linalg.eigh(expected)

@@ -26,9 +26,9 @@ _BEYOND_CHANCE = 5.0
 _MOST_PARAMETERS = 24
 _FEWEST_VIEWS = 8
 # Stretches of the recording that are left out in turn.
-_STRETCHES = 12
+STRETCHES = 12
 # A direction that one stretch alone tells is not known without it; its step is held to the inverse of this share.
-_LEAST_LEFT = 0.1
+LEAST_LEFT = 0.1
 _FEWEST_CORNERS = 6
 _AT_ONCE = 2_000_000  # derivatives, for memory
 _SAME_POSE = 1e-12  # of the information on a pose: corners in a line leave a turn about it open
@@ -151,10 +151,10 @@ def _beyond_chance(scores: np.ndarray, expected: np.ndarray) -> bool:
 
 def _jackknife(scores: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """Covariance (D, D) of the sum of scores from how the optimum moves when stretches of the views are left out."""
-    stretches = np.array_split(np.arange(len(scores)), min(_STRETCHES, len(scores)))
+    stretches = np.array_split(np.arange(len(scores)), min(STRETCHES, len(scores)))
     left, vectors = np.linalg.eigh(np.eye(scores.shape[1]) - np.stack([expected[s].sum(axis=0) for s in stretches]))
     own = np.stack([scores[s].sum(axis=0) for s in stretches])
-    turned = np.einsum("sij,si->sj", vectors, own) / np.maximum(left, _LEAST_LEFT)
+    turned = np.einsum("sij,si->sj", vectors, own) / np.maximum(left, LEAST_LEFT)
     moved = np.einsum("sij,sj->si", vectors, turned)
     return (1.0 - 1.0 / len(stretches)) * moved.T @ moved
 

@@ -13,7 +13,7 @@ from jaxcal.imu import imu_model
 from jaxcal.programs import stored_jit
 
 # Eigenvalues of the information matrix, scaled to unit diagonal, below which a direction counts as unobserved.
-_UNOBSERVED = 1e-11
+UNOBSERVED = 1e-11
 
 
 @stored_jit
@@ -33,11 +33,11 @@ def shared_covariance(
     with single_threaded_blas():
         schur, chain = (np.asarray(part) for part in _schur(equations))
     values, vectors, scale = _scaled_eigen(schur, free)
-    weak = values < _UNOBSERVED
+    weak = values < UNOBSERVED
     back = np.eye(len(schur)) if to_parameters is None else to_parameters
     open_ones = [_as_parameters(vectors[:, k] * scale, free, back, schur) for k in np.flatnonzero(weak)]
     sentences = [_unobserved_sentence(direction, np.asarray(labels)[free]) for direction in open_ones]
-    inverse = (vectors / np.maximum(values, _UNOBSERVED)) @ vectors.T
+    inverse = (vectors / np.maximum(values, UNOBSERVED)) @ vectors.T
     covariance = np.zeros(schur.shape)
     covariance[np.ix_(free, free)] = inverse * scale[:, None] * scale[None, :]
     return back @ covariance @ back.T, chain, sentences

@@ -1,5 +1,6 @@
 """What corners that err together do to the place of their camera: sigmas allow for it, for no more than is there."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,10 @@ import pytest
 
 from jaxcal import Calibration, Detections, calibrate_camera_imu, calibrate_cameras
 from jaxcal.calibration import outcome
+from jaxcal.calibration.assemble import CameraFrames
 from jaxcal.calibration.left_out import Wandering, wandering
+from jaxcal.calibration.robust import RobustFit
+from jaxcal.calibration.score_noise import ScoreNoise
 from jaxcal.simulation import SimulatedRig, paper_rig, simulate_detections, simulate_imu
 
 NOISE_PX = 0.05
@@ -61,7 +65,9 @@ def test_what_independent_corners_do_is_what_the_information_says(monkeypatch: p
     """The mean over many directions is one, within chance, were the camera looked at all the same."""
     looked: list[Wandering | None] = []
 
-    def look(fit, cameras, noises):  # pyright: ignore
+    def look(
+        fit: RobustFit, cameras: Sequence[CameraFrames], noises: Sequence[ScoreNoise | None]
+    ) -> list[Wandering | None]:
         looked.extend(wandering(fit, cameras, c) for c in range(2))
         return [None] * len(noises)
 
