@@ -5,10 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxcal.calibration import rig_graph, selection, solving
 from jaxcal.calibration.assemble import CameraFrames, camera_frames
 from jaxcal.calibration.board_checks import check_board
-from jaxcal.calibration.board_turns import symmetry_sentences, unify_turns
 from jaxcal.calibration.checks import resolve_models, resolve_names
 from jaxcal.calibration.initial_lens import initial_lens_and_rivals
 from jaxcal.calibration.lens_poses import board_poses
@@ -16,12 +14,13 @@ from jaxcal.calibration.outcome import calibration_from, chain_covariance_and_se
 from jaxcal.calibration.poses import Poses
 from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.restart import confirm_optimum
-from jaxcal.calibration.rig_graph import RigGraph, Sightings
-from jaxcal.calibration.robust import robust_fit
+from jaxcal.calibration.robust import RobustFit, robust_fit
 from jaxcal.calibration.rolling import shutters_of
+from jaxcal.calibration.selection import most_informative_views
 from jaxcal.calibration.state import RigState, SharedLayout, layout_of
+from jaxcal.calibration.synchronous import Synchronous, joined_by_others, tie_cameras
 from jaxcal.calibration.uncertainty import stamp_sigmas_of, with_common_delay
-from jaxcal.calibration.views import BoardFrames, associate, split_boards
+from jaxcal.calibration.views import BoardFrames, split_boards
 from jaxcal.cameras import CameraModel, model_name
 from jaxcal.errors import CalibrationError
 from jaxcal.estimation import LOSSES, Loss
@@ -59,12 +58,12 @@ def calibrate_cameras(
     rig moves on a continuous-time spline and a time offset is estimated for each camera (`timeshift_cam_cam0`).
     `rolling_shutter`, for all cameras or one each: video of a camera whose rows are seen one after another; the delay
     of a row is estimated on the spline as well (and the offsets with it), a frame's time is that of its first row.
-    `views`: use only that many views, chosen so that they tell most (`selection`). `board_warp` estimates how the
-    board is bent (two numbers); `point_offset_sigma_m` lets every point of the target move, under a prior of that
-    1-sigma in metres. `loss`: the robust loss under which outliers are found; they are left out of the final least
-    squares. `stamp_sigma_s`: as for `calibrate_camera_imu`, for the sigmas of `time_offsets`. The corner noise of each
-    camera is estimated from its residuals. The optimum is confirmed by a restart from
-    ten sigmas away.
+    `views`: the optimum and the outliers are looked for with that many views alone, chosen so that they tell most
+    (`selection`), and the others join once it is found: quicker for long recordings, and as precise. `board_warp`
+    estimates how the board is bent (two numbers); `point_offset_sigma_m` lets every point of the target move, under a
+    prior of that 1-sigma in metres. `loss`: the robust loss under which outliers are found; they are left out of the
+    final least squares. `stamp_sigma_s`: as for `calibrate_camera_imu`, for the sigmas of `time_offsets`. The corner
+    noise of each camera is estimated from its residuals. The optimum is confirmed by a restart from ten sigmas away.
 
     Raises CalibrationError when a camera has too few views, when no lens explains them, or when nothing connects the
     cameras (it names them, and the recording that would).
@@ -85,21 +84,16 @@ def calibrate_cameras(
         rolling=shutters,
     )
     shape = _Shape(layout, point_offset_sigma_m, loss)
+    search = _Search(look.rivals, max_steps, progress)
     if time_offsets:
         joint = _continuous(names, look, target, shape)
+        fit, restart = search.optimum(joint)
     else:
-        joint = _synchronous(names, look, target, shape, round(sync_tolerance_s * 1e9), views)
-    fit = robust_fit(
-        joint.problem,
-        joint.state,
-        joint.cameras,
-        joint.usable,
-        first_sigmas=[1.0] * len(cameras),
-        pose_parameters=joint.pose_parameters,
-        max_steps=max_steps,
-        progress=progress,
-    )
-    fit, restart = confirm_optimum(fit, joint.cameras, look.rivals, max_steps=max_steps)
+        tied, sentences = _tied(names, look, target, shape, round(sync_tolerance_s * 1e9))
+        joint = _of_views(tied, sentences)
+        fit, restart = (
+            search.optimum(joint) if views is None or views >= tied.count else search.by_few(tied, joint, views)
+        )
     covariance, _, sentences = chain_covariance_and_sentences(fit, names, look.lenses, joint.cameras)
     settings = {
         "job": "calibrate_cameras",
@@ -194,6 +188,63 @@ def _first_look(
     return _Look(lenses, rivals, list(cameras), boards, poses, [error for *_, error in found], sentences)
 
 
+@dataclass(frozen=True)
+class _Search:
+    """How the optimum is looked for."""
+
+    rivals: Sequence[Sequence[CameraModel]]
+    max_steps: int
+    progress: Progress
+
+    def optimum(self, joint: _Joint) -> tuple[RobustFit, list[str]]:
+        """The optimum from a first start, confirmed by restarts; and sentences about these."""
+        fit = self._robust_fit(joint, joint.state, [1.0] * len(joint.cameras), near=False)
+        return confirm_optimum(fit, joint.cameras, self.rivals, max_steps=self.max_steps)
+
+    def by_few(self, tied: Synchronous, joint: _Joint, count: int) -> tuple[RobustFit, list[str]]:
+        """The optimum of all views from that of the `count` views that tell most."""
+        chosen = most_informative_views(joint.problem, joint.state, count)
+        few, sentences = self.optimum(_of_views(tied.take(chosen), []))
+        state = joined_by_others(tied, joint.problem, joint.state, chosen, few, self.max_steps)
+        return self._robust_fit(joint, state, few.sigmas, near=True), sentences
+
+    def _robust_fit(self, joint: _Joint, state: RigState, sigmas: Sequence[float], near: bool) -> RobustFit:
+        return robust_fit(
+            joint.problem,
+            state,
+            joint.cameras,
+            joint.usable,
+            first_sigmas=sigmas,
+            pose_parameters=joint.pose_parameters,
+            max_steps=self.max_steps,
+            progress=self.progress,
+            near=near,
+        )
+
+
+def _tied(
+    names: Sequence[str], look: _Look, target: Target, shape: _Shape, tolerance_ns: int
+) -> tuple[Synchronous, list[str]]:
+    return tie_cameras(
+        names,
+        look.lenses,
+        look.cameras,
+        look.boards,
+        look.poses,
+        look.errors,
+        target,
+        tolerance_ns=tolerance_ns,
+        layout=shape.layout,
+        offset_sigma_m=shape.offset_sigma_m,
+        loss=shape.loss,
+    )
+
+
+def _of_views(tied: Synchronous, sentences: Sequence[str]) -> _Joint:
+    problem, state = tied.problem()
+    return _Joint(problem, state, list(tied.cameras), tied.usable(), tied.pose_parameters(), list(sentences))
+
+
 def _continuous(names: Sequence[str], look: _Look, target: Target, shape: _Shape) -> _Joint:
     from jaxcal.calibration.unsynchronised import continuous_problem  # brings scipy.interpolate: 0.1 s, seldom needed
 
@@ -210,63 +261,3 @@ def _continuous(names: Sequence[str], look: _Look, target: Target, shape: _Shape
     )
     parameters = start.pose_parameters(len(names))
     return _Joint(start.problem, start.state, look.cameras, start.usable, parameters, [])
-
-
-def _synchronous(
-    names: Sequence[str], look: _Look, target: Target, shape: _Shape, tolerance_ns: int, count: int | None
-) -> _Joint:
-    views, times = associate(look.cameras, tolerance_ns)
-    cameras, poses, sentences = look.cameras, look.poses, []
-    if len(target.turns) > 1:
-        unified = unify_turns(names, cameras, views, poses, target)
-        cameras, poses = unified.cameras, unified.poses
-        sentences = [*symmetry_sentences(target, len(names)), *unified.sentences]
-    sightings = [
-        Sightings(view[b.row], b.board, pose, error)
-        for view, b, pose, error in zip(views, look.boards, poses, look.errors, strict=True)
-    ]
-    graph = rig_graph.solve_graph(names, sightings, len(target.boards), tolerance_ns)
-    T_target_rig = rig_graph.rig_poses(graph, sightings, len(times))
-    problem, state = _problem(look.lenses, cameras, views, graph, T_target_rig, target, shape)
-    if count is not None and count < len(times):
-        chosen = selection.most_informative_views(problem, state, count)
-        number = np.full(len(times), -1)
-        number[chosen] = np.arange(len(chosen))
-        kept = [number[view] >= 0 for view in views]
-        cameras = [frames.take(np.flatnonzero(k)) for frames, k in zip(cameras, kept, strict=True)]
-        views = [number[view[k]] for view, k in zip(views, kept, strict=True)]
-        T_target_rig = (T_target_rig[0][chosen], T_target_rig[1][chosen])
-        problem, state = _problem(look.lenses, cameras, views, graph, T_target_rig, target, shape)
-    usable = [np.ones(len(frames.frames), dtype=bool) for frames in cameras]
-    return _Joint(problem, state, cameras, usable, _pose_parameters(views, len(T_target_rig[0])), sentences)
-
-
-def _problem(
-    lenses: Sequence[CameraModel],
-    cameras: Sequence[CameraFrames],
-    views: Sequence[np.ndarray],
-    graph: RigGraph,
-    T_target_rig: Poses,
-    target: Target,
-    shape: _Shape,
-) -> tuple[RigProblem, RigState]:
-    return solving.camera_problem(
-        lenses,
-        cameras,
-        target,
-        views=views,
-        weights=[np.ones(frames.seen.shape) for frames in cameras],
-        T_cam_rig=graph.T_cam_rig,
-        T_target_rig=T_target_rig,
-        loss_width=1.0,
-        layout=shape.layout,
-        boards=(graph.T_target_board[0][1:], graph.T_target_board[1][1:]),
-        offset_sigma_m=shape.offset_sigma_m,
-        loss=shape.loss,
-    )
-
-
-def _pose_parameters(views: Sequence[np.ndarray], count: int) -> list[float]:
-    """Pose parameters per camera: a view's six, shared among the cameras that see it."""
-    cameras_per_view = np.bincount(np.concatenate(views), minlength=count)
-    return [float(np.sum(6.0 / cameras_per_view[view])) for view in views]

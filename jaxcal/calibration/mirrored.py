@@ -36,27 +36,38 @@ def turn_mirrored(problem: RigProblem, state: RigState, max_steps: int) -> RigSt
     if problem.imu is not None or problem.layout.extra_boards:
         return state
     held = eqx.tree_at(lambda p: p.free, problem, jnp.zeros_like(problem.free))
-    for group, members in enumerate(problem.layout.groups):
-        for camera in members:
-            state = _turned_in(held, state, group, camera, max_steps)
-    return state
-
-
-def _turned_in(problem: RigProblem, state: RigState, group: int, camera: int, max_steps: int) -> RigState:
-    """The state with the views of one camera turned over where that is better; lenses and extrinsics stay."""
-    data = problem.corners[group]
-    rows = np.flatnonzero((np.asarray(data.rig_camera) == camera) & (np.asarray(data.weight).sum(axis=1) > 0))
-    trial = _mirrored(problem, state, group, camera, rows)
-    now, mirrored = (np.nanmedian(_errors(problem, s)[group][rows], axis=1) for s in (state, trial))
-    alike = np.asarray(data.view)[rows[mirrored < _ALIKE * now]]
+    trial, alike = _likest_mirror_images(held, state)
     if not len(alike):
         return state
-    trial = _merged(state, trial, alike)
-    trial = solve(problem, trial, max_steps=min(max_steps, _STEPS), rtol=_ENOUGH_TO_COMPARE).state
-    better = alike[_cost(problem, trial)[alike] < _cost(problem, state)[alike] * (1.0 - _LOWER)]
+    trial = solve(held, trial, max_steps=min(max_steps, _STEPS), rtol=_ENOUGH_TO_COMPARE).state
+    now, turned = (_costs(held, _errors(held, s))[alike] for s in (state, trial))
+    better = alike[turned < now * (1.0 - _LOWER)]
     if len(better):
-        logger.info("camera %d: %d of %d views turned over", camera, len(better), len(rows))
+        logger.info("%d of %d views turned over", len(better), len(alike))
     return _merged(state, trial, better)
+
+
+def _likest_mirror_images(problem: RigProblem, state: RigState) -> tuple[RigState, np.ndarray]:
+    """The state with views turned over whose mirror image looks much like them, and which these are.
+
+    A view that several cameras see is turned about the line of sight of the one whose mirror image fits all of them
+    best: from there, those of the others would run to the same pose.
+    """
+    now = _errors(problem, state)
+    trial, lowest, alike = state, np.full(len(state.rotations), np.inf), []
+    for group, data in enumerate(problem.corners):
+        rig_camera, seen = np.asarray(data.rig_camera), np.asarray(data.weight).sum(axis=1) > 0
+        for camera in problem.layout.groups[group]:
+            rows = np.flatnonzero((rig_camera == camera) & seen)
+            candidate = _mirrored(problem, state, group, camera, rows)
+            errors = _errors(problem, candidate)
+            before, after = (np.nanmedian(e[group][rows], axis=1) for e in (now, errors))
+            views, cost = np.asarray(data.view)[rows[after < _ALIKE * before]], _costs(problem, errors)
+            alike.append(views)
+            nearer = views[cost[views] < lowest[views]]
+            lowest[nearer] = cost[nearer]
+            trial = _merged(trial, candidate, nearer)
+    return trial, np.unique(np.concatenate(alike))
 
 
 def _mirrored(problem: RigProblem, state: RigState, group: int, camera: int, rows: np.ndarray) -> RigState:
@@ -96,10 +107,10 @@ def _errors(problem: RigProblem, state: RigState) -> list[np.ndarray]:
     return out
 
 
-def _cost(problem: RigProblem, state: RigState) -> np.ndarray:
-    """The cost (K,) of each view, by Huber's loss."""
-    cost = np.zeros(len(state.rotations))
-    for data, errors in zip(problem.corners, _errors(problem, state), strict=True):
-        near = np.minimum(errors, _WIDTH_SIGMAS)
-        np.add.at(cost, np.asarray(data.view), np.nansum(near * (errors - 0.5 * near), axis=1))
+def _costs(problem: RigProblem, errors: list[np.ndarray]) -> np.ndarray:
+    """The cost (K,) of each view from the errors of its corners, by Huber's loss."""
+    cost = np.zeros(problem.free_chain.shape[0])
+    for data, error in zip(problem.corners, errors, strict=True):
+        near = np.minimum(error, _WIDTH_SIGMAS)
+        np.add.at(cost, np.asarray(data.view), np.nansum(near * (error - 0.5 * near), axis=1))
     return cost

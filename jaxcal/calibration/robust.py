@@ -23,6 +23,8 @@ logger = logging.getLogger(__name__)
 
 _HUBER_SIGMAS = 2.5
 ROUNDS = 5
+# From this round on: plain least squares on the inliers.
+_PLAIN = 3
 # All rounds but the last only find the noise and the outliers: they end when a step promises less than this share of
 # the cost, which is a hundredth of a sigma in each of a thousand parameters.
 _ENOUGH_FOR_NOISE = 1e-5
@@ -65,6 +67,7 @@ def robust_fit(
     max_steps: int,
     progress: Progress,
     reweigh: Reweigh | None = None,
+    near: bool = False,
 ) -> RobustFit:
     """Solve, estimating the corner noise of each camera and leaving outliers out.
 
@@ -72,23 +75,23 @@ def robust_fit(
     weighted by what it adds (`redundancy`); plain least squares on the inliers, noisy views weighted down
     (`view_noise`); the same with the noise of the inliers (root mean square) and the inliers chosen anew. `usable[c]`
     (F,) are the frames that may take part; `pose_parameters[c]` how many parameters of the trajectory a camera's
-    corners pay for, for the degrees of freedom.
+    corners pay for, for the degrees of freedom. `near`: `state` lies near the optimum, with
+    noise of `first_sigmas`, and the first round is left out.
     """
     seen = [frames.seen & ok[:, None] for frames, ok in zip(cameras, usable, strict=True)]
     parameters = estimated_parameters(problem, pose_parameters)
     known = _first_guess(seen, first_sigmas)
     result: SolveResult | None = None
     errors: list[np.ndarray] = []
-    for stage in range(ROUNDS):
+    for stage in range(1 if near else 0, ROUNDS):
         progress("optimise", stage, ROUNDS)
         problem = _adapted(problem, cameras, known, stage, result, reweigh)
-        last = stage == ROUNDS - 1
         result = solve(
             problem,
             state,
             max_steps=max_steps,
-            rtol=0.0 if last else _ENOUGH_FOR_NOISE,
-            damping=FIRST_DAMPING if result is None else _NEXT_DAMPING,
+            rtol=0.0 if stage == ROUNDS - 1 else _ENOUGH_FOR_NOISE,
+            damping=FIRST_DAMPING if stage == 0 else _NEXT_DAMPING,
         )
         # With the noise known and the lens near its optimum: before views and corners are judged by their errors.
         state = turn_mirrored(problem, result.state, max_steps) if stage == 1 else result.state
@@ -130,6 +133,11 @@ def _first_guess(seen: Sequence[np.ndarray], sigmas: Sequence[float]) -> _Known:
     return _Known(list(seen), list(sigmas), alike, all_alike([len(s) for s in seen]))
 
 
+def with_sigmas(problem: RigProblem, cameras: Sequence[CameraFrames], sigmas: Sequence[float]) -> RigProblem:
+    """The problem with corner noise known, px per camera, and Huber's loss in case of outliers."""
+    return _with_weights(problem, cameras, _first_guess([frames.seen for frames in cameras], sigmas), _HUBER_SIGMAS)
+
+
 def _adapted(
     problem: RigProblem,
     cameras: Sequence[CameraFrames],
@@ -139,7 +147,7 @@ def _adapted(
     reweigh: Reweigh | None,
 ) -> RigProblem:
     """The problem of a round: weights from what is known, and what the last round's `result` says of the rest."""
-    problem = _with_weights(problem, cameras, known, _HUBER_SIGMAS if stage < 3 else np.inf)
+    problem = _with_weights(problem, cameras, known, _HUBER_SIGMAS if stage < _PLAIN else np.inf)
     if result is None:
         return problem
     if reweigh is not None:
@@ -161,7 +169,7 @@ def _learnt(
     # In units of an ordinary corner: what a detector knows to be vague may err more.
     scaled = _in_usual_units(errors, cameras, known.noise)
     kept, sigmas, redundancy, noise = known.kept, known.sigmas, known.redundancy, known.noise
-    if stage < 3:
+    if stage < _PLAIN:
         sigmas = [outliers.robust_sigma(e, s) for e, s in zip(scaled, kept, strict=True)]
     if stage == 1:
         redundancy = [measure_redundancy(*parts) for parts in zip(cameras, scaled, seen, sigmas, strict=True)]
@@ -172,9 +180,9 @@ def _learnt(
         redundancy, noise = [w for w, _ in weighed], [n for _, n in weighed]
         scaled = [e / n[:, None, None] for e, n in zip(scaled, noise, strict=True)]
         sigmas = [outliers.robust_sigma(e, k) for e, k in zip(scaled, kept, strict=True)]
-    if stage >= 3:
+    if stage >= _PLAIN:
         sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(scaled, kept, parameters, strict=True)]
-    if stage == 3:
+    if stage == _PLAIN:
         # Good corners that outliers in the same view had pulled away are taken back.
         kept = [outliers.inliers(e, s, sigma) for e, s, sigma in zip(scaled, seen, sigmas, strict=True)]
     return _Known(kept, sigmas, redundancy, noise)

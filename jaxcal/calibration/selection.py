@@ -58,18 +58,18 @@ def view_information(problem: RigProblem, state: RigState) -> Float[np.ndarray, 
     window = np.zeros((views, 6, 6))
     for group, data in enumerate(problem.corners):
         with single_threaded_blas():
-            parts = [np.asarray(part) for part in _frame_equations(problem, state, group)]
-        for f, (own, between, pose) in enumerate(zip(*parts, strict=True)):
-            if not pose.any():
-                continue
-            view, columns = int(data.view[f]), problem.columns(int(data.rig_camera[f]))
-            shared[view][np.ix_(columns, columns)] += own
-            cross[view][:, columns] += between
-            window[view] += pose
+            own, between, pose = (np.asarray(part) for part in _frame_equations(problem, state, group))
+        view_of, camera_of, seen = np.asarray(data.view), np.asarray(data.rig_camera), pose.any(axis=(1, 2))
+        for camera in np.unique(camera_of):
+            rows = np.flatnonzero(seen & (camera_of == camera))  # a camera has one frame in a view
+            view, columns = view_of[rows], problem.columns(int(camera))
+            shared[np.ix_(view, columns, columns)] += own[rows]
+            cross[np.ix_(view, np.arange(6), columns)] += between[rows]
+            window[view] += pose[rows]
     free = np.asarray(problem.free)
     seen = window.any(axis=(1, 2))
     window[~seen] = np.eye(6)
-    reduced = shared - np.einsum("vbp,vbq->vpq", cross, np.linalg.solve(window, cross))
+    reduced = shared - cross.swapaxes(1, 2) @ np.linalg.solve(window, cross)
     return reduced[:, free][:, :, free]
 
 

@@ -230,22 +230,3 @@ def test_the_cost_is_never_above_opencvs_on_the_same_corners() -> None:
             points, pixels, SIZE, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3, criteria=(3, 200, 1e-14)
         )
         assert camera.reprojection_rms_px <= theirs * (1 + 1e-8)
-
-
-@pytest.mark.slow
-def test_views_are_chosen_by_what_they_tell() -> None:
-    rng = np.random.default_rng(31)
-    # Most views are far and frontal and tell little; every tenth is close and tilted.
-    dull = board_poses(rng, 90, BOARD, tilt_rad=0.05, distance_m=(2.0, 2.5))
-    telling = board_poses(rng, 10, BOARD, tilt_rad=0.6, distance_m=(0.5, 0.8))
-    poses = np.concatenate([dull, telling])[np.argsort(rng.random(100))]
-    detections = seen(LENS, poses, BOARD.points, NOISE_PX, rng)
-    chosen = calibrate_cameras([detections], BOARD, views=VIEWS)
-    everything = calibrate_cameras([detections], BOARD)
-    used = np.unique(detections.frame[chosen.cameras[0].used])
-    assert len(used) == VIEWS
-    close = np.flatnonzero(poses[:, 2, 3] < 1.5)
-    assert set(close) <= set(used)
-    assert np.all(chosen.std("cam0.intrinsics") < 1.15 * everything.std("cam0.intrinsics"))
-    again = calibrate_cameras([detections], BOARD, views=VIEWS)
-    np.testing.assert_array_equal(again.cameras[0].used, chosen.cameras[0].used)
