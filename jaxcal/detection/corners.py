@@ -11,7 +11,7 @@ from jaxcal.errors import CalibrationError
 from jaxcal.targets import AprilGrid, BoardSet, Charuco, Checkerboard, CircleGrid, Target
 
 # Raised whenever the same image could give other corners than before: cached detections are then made anew.
-DETECTOR_VERSION = 5
+DETECTOR_VERSION = 6
 
 
 def find_corners(image: np.ndarray, target: Target) -> tuple[np.ndarray, np.ndarray]:

@@ -18,6 +18,8 @@ _ASKED = 24  # which so many of its corners tell
 _ROUNDS, _SETTLED_PX = 6, 2e-3
 # Of the grey levels' variance in a window, what the pattern alone has to explain; and how far a corner may go.
 _LEAST_EXPLAINED, _LONGEST_WAY_PX = 0.3, 2.0
+_MOST = 0.8  # of the corners, where the pattern counts as seen
+_LOOKS = 2  # more, where corners were out of place
 _DOUBTFUL_PX = 1.0  # so far from where the others expect it, a corner is looked for there, too
 
 
@@ -49,19 +51,39 @@ def fitted_corners(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Corners (N, 2) as `fit_pattern` places them, px, and which of them (N,) lie where the others say they should.
 
+    Where the pattern is seen at most corners, it has to be at every one: those without it are looked for anew where
+    the view of the others has them. And where some were far out of place, which bent the view of all and what their
+    neighbours were expected to look like, all are placed anew.
+
     Fewer than 8, which do not tell how the board is seen, stay where they are and are all kept.
     """
     if len(board) < FEWEST:
         return pixels, np.ones(len(board), bool)
-    view = fit_view(board, pixels, (image.shape[1], image.shape[0]))
-    moved = pixels if view is None else fit_pattern(image, board, pixels, reach, view)
-    return moved, agreeing_with(view, board, moved)
+    size = (image.shape[1], image.shape[0])
+    view = fit_view(board, pixels, size)
+    if view is None:
+        return pixels, agreeing_with(view, board, pixels)
+    moved, seen = fit_pattern(image, board, pixels, reach, view)
+    if np.mean(seen) < _MOST:
+        return moved, agreeing_with(view, board, moved)
+    start = pixels
+    for _ in range(_LOOKS):
+        stayed = np.linalg.norm(moved - start, axis=1) <= _DOUBTFUL_PX
+        if (seen & stayed).all() or seen.sum() < FEWEST:
+            break
+        of_others = fit_view(board[seen], moved[seen], size)
+        if of_others is None:
+            break
+        view, start = of_others, np.where(seen[:, None], moved, of_others.pixels(board))
+        moved, seen = fit_pattern(image, board, start, reach, view)
+    return moved, seen & agreeing_with(view, board, moved)
 
 
 def fit_pattern(
     image: np.ndarray, board: np.ndarray, pixels: np.ndarray, reach: tuple[float, float], view: BoardView
-) -> np.ndarray:
-    """Corners (N, 2), px, moved to where the black and white squares that meet there fit the grey image best.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (N, 2), px, moved to where the black and white squares that meet there fit the grey image best, and
+    which of them (N,) the pattern is seen at; those too small in the image to tell count as such.
 
     `board` (N, 2), m, are their places on the board; `pixels` (N, 2) in the image, right within a pixel or so. The
     pattern is known as far as `reach` (m; along and up the board) from a corner, and seen as `view` and the corners
@@ -76,8 +98,9 @@ def fit_pattern(
     views = _views(board, pixels, view)
     along, up, half_px = _half_windows(image, views, pixels, reach)
     rows = np.flatnonzero(np.isfinite(views.inverse).all(axis=(1, 2)) & (half_px >= _SMALLEST_HALF))
+    seen = np.ones(len(pixels), bool)
     if not len(rows):
-        return pixels
+        return pixels, seen
     views, start, half_px = views.take(rows), pixels[rows], half_px[rows]
     line = np.linspace(-1.0, 1.0, 2 * int(np.ceil(np.median(half_px))) + 1)  # about a sample in a pixel
     places = along[rows, None] * line, up[rows, None] * line
@@ -92,7 +115,8 @@ def fit_pattern(
         moved[doubtful[chosen]], share[doubtful[chosen]] = again[chosen], better[chosen]
     out = pixels.copy()
     out[rows[share > 0.0]] = moved[share > 0.0]
-    return out
+    seen[rows] = share > 0.0
+    return out, seen
 
 
 def _blur(grey: np.ndarray, corners: np.ndarray, views: _Views, along: np.ndarray, up: np.ndarray) -> float:

@@ -3,6 +3,9 @@
 import cv2
 import numpy as np
 
+# So near to the edge of the image, half of what tells a corner's place is missing: corners in frames of events err by
+# 0.3 px at 4 px from it, 0.17 at 5 px, 0.06 from 10 px on (root mean square, table 1's recordings).
+_EDGE_PX = 5.0
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
 
 
@@ -10,8 +13,8 @@ def refine_corners(image: np.ndarray, corners: np.ndarray, half: np.ndarray) -> 
     """Corners (N, 2) moved to where the image's gradients say they are, and which of them (N,) can be trusted.
 
     `half` (N,) is half the window's width in pixels: the window is 2 half + 1 wide. Corners whose window would leave
-    the image get a smaller one, down to 2; those nearer to the edge are not trusted. Nor is a corner that moved
-    further than its window. Method: Foerstner & Guelch 1987, as `cv2.cornerSubPix`.
+    the image get a smaller one; those within 5 px of the edge, where errors grow to several times as much, are not
+    trusted. Nor is a corner that moved further than its window. Method: Foerstner & Guelch 1987, as `cv2.cornerSubPix`.
     """
     height, width = image.shape
     edge = np.minimum(corners, np.array([width - 1.0, height - 1.0]) - corners).min(axis=1)
@@ -27,4 +30,5 @@ def refine_corners(image: np.ndarray, corners: np.ndarray, half: np.ndarray) -> 
         smooth = cv2.GaussianBlur(image, (0, 0), min(1.0, 0.2 * size))
         refined[rows] = cv2.cornerSubPix(smooth, start, window, (-1, -1), _CRITERIA).reshape(-1, 2)
     moved = np.linalg.norm(refined - corners, axis=1)
-    return refined, trusted & (moved <= half) & np.isfinite(refined).all(axis=1)
+    inside = np.minimum(refined, np.array([width - 1.0, height - 1.0]) - refined).min(axis=1) >= _EDGE_PX
+    return refined, trusted & inside & (moved <= half) & np.isfinite(refined).all(axis=1)

@@ -121,6 +121,41 @@ def test_a_corner_out_of_place_is_found_where_its_neighbours_say(which: int, ang
     assert np.abs(fit_pattern(drawn.image, known, start, reach) - true).max() < 0.1
 
 
+@pytest.mark.parametrize("turn", [0.5, 2.0, 3.5, 5.0])
+def test_the_outermost_corner_far_out_of_place_bends_nothing(turn: float) -> None:
+    """At the rim of the board a wrong corner bends the view of all; where it was, no edges meet."""
+    drawn = view(CHECKERBOARD, 0.2, (0.2, 0.2), noise=4)
+    known, true, reach = grid(drawn, CHECKERBOARD)
+    start = true.copy()
+    start[0] = drawn.pixels[[0, 1, CHECKERBOARD.cols, CHECKERBOARD.cols + 1]].mean(axis=0)  # in the middle of a square
+    start[0] += np.array([np.cos(turn), np.sin(turn)])
+    found, kept = fitted_corners(drawn.image, known, start, reach)
+    assert kept.all()
+    assert np.abs(found - true).max() < 0.1
+
+
+def test_a_corner_whose_pattern_is_hidden_is_left_out() -> None:
+    drawn = view(CHECKERBOARD, 0.2, (0.2, 0.2), noise=4)
+    known, true, reach = grid(drawn, CHECKERBOARD)
+    hidden = drawn.image.copy()
+    cv2.circle(hidden, tuple(np.round(true[0]).astype(int).tolist()), 14, 120, -1)
+    found, kept = fitted_corners(hidden, known, true, reach)
+    assert not kept[0]
+    assert kept[1:].all()
+    assert np.abs(found - true)[kept].max() < 0.1
+
+
+def test_corners_at_the_edge_of_the_image_are_not_trusted() -> None:
+    drawn = view(CHECKERBOARD, 0.0, (0.0, 0.0), 0)
+    for edge, trusted in ((4.0, False), (7.0, True)):
+        cut = int(np.floor(drawn.pixels[0, 0] - edge))
+        pixels = drawn.pixels[:1] - [cut, 0]
+        refined, kept = refine_corners(np.ascontiguousarray(drawn.image[:, cut:]), pixels, np.array([9]))
+        assert kept[0] == trusted
+        if trusted:
+            assert np.abs(refined - pixels).max() < 0.2
+
+
 @pytest.mark.parametrize("grey", [np.zeros, np.ones, None], ids=["black", "one grey", "noise"])
 def test_where_there_is_no_pattern_corners_stay(grey: Callable[..., np.ndarray] | None) -> None:
     known, true, reach = grid(view(CHECKERBOARD, 0.2, (0.2, 0.2), 0), CHECKERBOARD)
