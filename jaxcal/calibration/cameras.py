@@ -29,6 +29,8 @@ from jaxcal.progress import Progress, no_progress, track
 from jaxcal.results import Calibration
 from jaxcal.targets import Target
 
+_FEWEST_VIEWS = 3  # of a camera
+
 
 def calibrate_cameras(
     detections: Sequence[Detections],
@@ -91,9 +93,7 @@ def calibrate_cameras(
     else:
         tied, sentences = _tied(names, look, target, shape, round(sync_tolerance_s * 1e9))
         joint = _of_views(tied, sentences)
-        fit, restart = (
-            search.optimum(joint) if views is None or views >= tied.count else search.by_few(tied, joint, views)
-        )
+        fit, restart = search.optimum(joint) if views is None else search.by_few(tied, joint, views)
     covariance, _, sentences = chain_covariance_and_sentences(fit, names, look.lenses, joint.cameras)
     settings = {
         "job": "calibrate_cameras",
@@ -124,8 +124,10 @@ def calibrate_cameras(
 def _check_options(target: Target, time_offsets: bool, views: int | None, loss: str) -> None:
     if loss not in LOSSES:
         raise CalibrationError(f"robust loss '{loss}' is unknown; known: {', '.join(LOSSES)}.")
-    if views is not None and views < 3:
-        raise CalibrationError(f"views={views}: a calibration needs 3 views at least; 20 or more make a good one.")
+    if views is not None and views < _FEWEST_VIEWS:
+        raise CalibrationError(
+            f"views={views}: a calibration needs {_FEWEST_VIEWS} views at least; 20 or more make a good one."
+        )
     if time_offsets and views is not None:
         raise CalibrationError("time_offsets and views: a trajectory needs all frames. Leave `views` out.")
     if time_offsets and len(target.boards) > 1:
@@ -202,9 +204,13 @@ class _Search:
         return confirm_optimum(fit, joint.cameras, self.rivals, max_steps=self.max_steps)
 
     def by_few(self, tied: Synchronous, joint: _Joint, count: int) -> tuple[RobustFit, list[str]]:
-        """The optimum of all views from that of the `count` views that tell most."""
+        """The optimum of all views from that of the `count` views that tell most; straight from all where so few
+        views do not make a calibration of every camera."""
         chosen = most_informative_views(joint.problem, joint.state, count)
-        few, sentences = self.optimum(_of_views(tied.take(chosen), []))
+        part = tied.take(chosen)
+        if len(chosen) == tied.count or min(len(frames.frames) for frames in part.cameras) < _FEWEST_VIEWS:
+            return self.optimum(joint)
+        few, sentences = self.optimum(_of_views(part, []))
         state = joined_by_others(tied, joint.problem, joint.state, chosen, few, self.max_steps)
         return self._robust_fit(joint, state, few.sigmas, near=True), sentences
 

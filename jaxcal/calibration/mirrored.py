@@ -30,7 +30,7 @@ def turn_mirrored(problem: RigProblem, state: RigState, max_steps: int) -> RigSt
 
     First poses are told from their mirror images by a first lens, and what decides between them may be smaller than
     the errors of that lens; no step of the optimisation turns a board over afterwards. Here the lenses are held where
-    the optimisation took them, and the mirrored views (about the line of sight of each camera in turn) adapted.
+    the optimisation took them, and the mirrored views adapted.
     For problems of views alone, of one flat board: a trajectory says by itself which way a board turns.
     """
     if problem.imu is not None or problem.layout.extra_boards:

@@ -8,6 +8,7 @@ from scipy.special import erf
 
 from jaxcal.detection.board_view import BoardView, fit_view
 from jaxcal.detection.outliers import FEWEST, agreeing_with
+from jaxcal.detection.refine import inside
 
 _NEIGHBOURS = 14  # corners, itself among them, that a quadratic function around one is fitted to
 _THEREABOUTS = 6  # of which so many tell whether it is a good one
@@ -63,9 +64,10 @@ def fitted_corners(
     view = fit_view(board, pixels, size)
     if view is None:
         return pixels, agreeing_with(view, board, pixels)
-    moved, seen = fit_pattern(image, board, pixels, reach, view)
+    moved, share = fit_pattern(image, board, pixels, reach, view)
+    seen = share != 0.0
     if np.mean(seen) < _MOST:
-        return moved, agreeing_with(view, board, moved)
+        return moved, inside(moved, size) & agreeing_with(view, board, moved)
     start = pixels
     for _ in range(_LOOKS):
         stayed = np.linalg.norm(moved - start, axis=1) <= _DOUBTFUL_PX
@@ -75,15 +77,17 @@ def fitted_corners(
         if of_others is None:
             break
         view, start = of_others, np.where(seen[:, None], moved, of_others.pixels(board))
-        moved, seen = fit_pattern(image, board, start, reach, view)
-    return moved, seen & agreeing_with(view, board, moved)
+        moved, share = fit_pattern(image, board, start, reach, view)
+        seen = np.where(seen, share != 0.0, share > 0.0)
+    return moved, seen & inside(moved, size) & agreeing_with(view, board, moved)
 
 
 def fit_pattern(
     image: np.ndarray, board: np.ndarray, pixels: np.ndarray, reach: tuple[float, float], view: BoardView
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (N, 2), px, moved to where the black and white squares that meet there fit the grey image best, and
-    which of them (N,) the pattern is seen at; those too small in the image to tell count as such.
+    """Corners (N, 2), px, moved to where the black and white squares that meet there fit the grey image best, and the
+    share (N,) of the grey levels' variance that the pattern explains there: 0 where that is too little, not a number
+    where the pattern is too small in the image, or too near to its edge, to tell.
 
     `board` (N, 2), m, are their places on the board; `pixels` (N, 2) in the image, right within a pixel or so. The
     pattern is known as far as `reach` (m; along and up the board) from a corner, and seen as `view` and the corners
@@ -98,9 +102,9 @@ def fit_pattern(
     views = _views(board, pixels, view)
     along, up, half_px = _half_windows(image, views, pixels, reach)
     rows = np.flatnonzero(np.isfinite(views.inverse).all(axis=(1, 2)) & (half_px >= _SMALLEST_HALF))
-    seen = np.ones(len(pixels), bool)
+    shares = np.full(len(pixels), np.nan)
     if not len(rows):
-        return pixels, seen
+        return pixels, shares
     views, start, half_px = views.take(rows), pixels[rows], half_px[rows]
     line = np.linspace(-1.0, 1.0, 2 * int(np.ceil(np.median(half_px))) + 1)  # about a sample in a pixel
     places = along[rows, None] * line, up[rows, None] * line
@@ -115,8 +119,8 @@ def fit_pattern(
         moved[doubtful[chosen]], share[doubtful[chosen]] = again[chosen], better[chosen]
     out = pixels.copy()
     out[rows[share > 0.0]] = moved[share > 0.0]
-    seen[rows] = share > 0.0
-    return out, seen
+    shares[rows] = share
+    return out, shares
 
 
 def _blur(grey: np.ndarray, corners: np.ndarray, views: _Views, along: np.ndarray, up: np.ndarray) -> float:

@@ -30,5 +30,9 @@ def refine_corners(image: np.ndarray, corners: np.ndarray, half: np.ndarray) -> 
         smooth = cv2.GaussianBlur(image, (0, 0), min(1.0, 0.2 * size))
         refined[rows] = cv2.cornerSubPix(smooth, start, window, (-1, -1), _CRITERIA).reshape(-1, 2)
     moved = np.linalg.norm(refined - corners, axis=1)
-    inside = np.minimum(refined, np.array([width - 1.0, height - 1.0]) - refined).min(axis=1) >= _EDGE_PX
-    return refined, trusted & inside & (moved <= half) & np.isfinite(refined).all(axis=1)
+    return refined, trusted & inside(refined, (width, height)) & (moved <= half) & np.isfinite(refined).all(axis=1)
+
+
+def inside(corners: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+    """Which corners (N, 2), px, are far enough from the edge of the image (N,) to be trusted."""
+    return np.minimum(corners, np.array(image_size) - 1.0 - corners).min(axis=1) >= _EDGE_PX

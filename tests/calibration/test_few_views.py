@@ -68,3 +68,19 @@ def test_a_start_with_few_views_ends_where_all_views_lead(cameras: int) -> None:
         assert np.mean(of_few.used == of_all.used) > 0.999
     again = calibrate_cameras(detections, BOARD, views=10)
     np.testing.assert_array_equal(again.cameras[0].model.parameters, few.cameras[0].model.parameters)
+
+
+def test_where_few_views_leave_a_camera_out_all_are_solved_at_once() -> None:
+    """Two cameras that hardly share a view: three views cannot make a calibration of both."""
+    rng = np.random.default_rng(7)
+    poses, detections = board_poses(rng, 24, BOARD), []
+    for c in range(2):
+        beside = poses.copy()
+        beside[:, 0, 3] -= 0.1 * c
+        both = seen(LENS, beside, BOARD.points, NOISE_PX, rng)
+        rows = (both.frame < 2) | (both.frame % 2 == c)
+        own = {"frame": both.frame[rows], "point": both.point[rows], "pixels": both.pixels[rows]}
+        detections.append(dataclasses.replace(both, **own))
+    few, everything = (calibrate_cameras(detections, BOARD, views=number) for number in (3, None))
+    for one, other in zip(few.cameras, everything.cameras, strict=True):
+        np.testing.assert_array_equal(one.model.parameters, other.model.parameters)

@@ -145,6 +145,18 @@ def test_a_corner_whose_pattern_is_hidden_is_left_out() -> None:
     assert np.abs(found - true)[kept].max() < 0.1
 
 
+def test_a_corner_that_lies_outside_the_image_is_left_out() -> None:
+    drawn = view(CHECKERBOARD, 0.2, (0.2, 0.2), noise=4)
+    known, true, reach = grid(drawn, CHECKERBOARD)
+    leftmost = int(np.argmin(true[:, 0]))
+    cut = int(np.ceil(true[leftmost, 0])) + 3
+    start = true - [cut, 0]
+    start[leftmost, 0] += 25.0
+    found, kept = fitted_corners(np.ascontiguousarray(drawn.image[:, cut:]), known, start, reach)
+    assert not kept[leftmost]
+    assert np.abs(found - true + [cut, 0])[kept].max() < 0.1
+
+
 def test_corners_at_the_edge_of_the_image_are_not_trusted() -> None:
     drawn = view(CHECKERBOARD, 0.0, (0.0, 0.0), 0)
     for edge, trusted in ((4.0, False), (7.0, True)):
