@@ -18,7 +18,8 @@ def collection_paused() -> Iterator[None]:
     """No cyclic garbage collection meanwhile.
 
     Importing jax, scipy and their like makes hundreds of thousands of objects, all of which stay; collections in
-    between look at every one of them again and find nothing, for a sixth of the time.
+    between look at every one of them again and find nothing, for a sixth of the time. Afterwards all objects are of the
+    oldest generation, as they would be by now: else the next two collections would look at all of them, as young ones.
     """
     was_on = gc.isenabled()
     gc.disable()
@@ -26,4 +27,7 @@ def collection_paused() -> Iterator[None]:
         yield
     finally:
         if was_on:
+            if not gc.get_freeze_count():  # what somebody has frozen stays so
+                gc.freeze()
+                gc.unfreeze()
             gc.enable()

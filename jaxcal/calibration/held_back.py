@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.calibration import rig_graph, solving
@@ -66,7 +65,7 @@ def held_back_residuals(
         loss_width=_HUBER_SIGMAS,
         layout=layout,
     )
-    problem = eqx.tree_at(lambda p: p.free, problem, jnp.zeros(layout.size, dtype=bool))
+    problem = eqx.tree_at(lambda p: p.free, problem, on_device(np.zeros(layout.size, dtype=bool)))
     state = eqx.tree_at(lambda s: s.target, state, known_target(calibration))
     result = solve(problem, state, max_steps=max_steps)
     errors = split_groups(layout, frames, [np.asarray(e) for e in corner_errors(problem, result.state)])
@@ -98,6 +97,6 @@ def known_target(calibration: Calibration, warp: bool | None = None) -> TargetSt
     return TargetState(
         R_target_board=on_device(boards[:, :3, :3]),
         t_target_board=on_device(boards[:, :3, 3]),
-        warp=jnp.zeros(0) if bend is None else on_device(bend),
-        offsets=jnp.zeros((0, 3)) if offsets is None else on_device(offsets),
+        warp=on_device(np.zeros(0)) if bend is None else on_device(bend),
+        offsets=on_device(np.zeros((0, 3))) if offsets is None else on_device(offsets),
     )

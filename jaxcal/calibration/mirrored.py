@@ -3,7 +3,6 @@
 import logging
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.calibration.initial_poses import mirrored_poses
@@ -35,7 +34,7 @@ def turn_mirrored(problem: RigProblem, state: RigState, max_steps: int) -> RigSt
     """
     if problem.imu is not None or problem.layout.extra_boards:
         return state
-    held = eqx.tree_at(lambda p: p.free, problem, jnp.zeros_like(problem.free))
+    held = eqx.tree_at(lambda p: p.free, problem, on_device(np.zeros(problem.free.shape, dtype=bool)))
     trial, alike = _likest_mirror_images(held, state)
     if not len(alike):
         return state

@@ -124,7 +124,7 @@ def camera_problem(
         R_cam_rig=on_device(T_cam_rig[0]),
         t_cam_rig=on_device(T_cam_rig[1]),
         shift=on_device(np.zeros(layout.num_cameras)),
-        gravity=jnp.array([0.0, 0.0, -1.0]),
+        gravity=on_device([0.0, 0.0, -1.0]),
         rotations=on_device(rotations),
         positions=on_device(positions),
         biases=on_device(np.zeros((len(positions), 0))),

@@ -204,10 +204,10 @@ class RigState(eqx.Module):
     biases: Float[Array, "K b"]
     target: TargetState
     imu_parameters: tuple[Float[Array, "_"], ...] = ()
-    R_imu_rig: Float[Array, "M 3 3"] = eqx.field(default_factory=lambda: jnp.zeros((0, 3, 3)))
-    t_imu_rig: Float[Array, "M 3"] = eqx.field(default_factory=lambda: jnp.zeros((0, 3)))
-    imu_shift: Float[Array, " M"] = eqx.field(default_factory=lambda: jnp.zeros(0))
-    line_delay: Float[Array, " D"] = eqx.field(default_factory=lambda: jnp.zeros(0))
+    R_imu_rig: Float[Array, "M 3 3"] = eqx.field(default_factory=lambda: on_device(np.zeros((0, 3, 3))))
+    t_imu_rig: Float[Array, "M 3"] = eqx.field(default_factory=lambda: on_device(np.zeros((0, 3))))
+    imu_shift: Float[Array, " M"] = eqx.field(default_factory=lambda: on_device(np.zeros(0)))
+    line_delay: Float[Array, " D"] = eqx.field(default_factory=lambda: on_device(np.zeros(0)))
 
     def retract(self, layout: SharedLayout, chain: Float[Array, "K B"], shared: Float[Array, " P"]) -> "RigState":
         """Move along a tangent step: rotations of the chain on the right, those of the cameras on the left."""

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.calibration import initial_imu, solving, spline_setup
@@ -93,7 +92,7 @@ def continuous_problem(
         geometry=geometry_of(target, offset_sigma_m),
         imu=_motion_prior(grid),
         prior=solving.lens_prior(lenses, layout, cameras),
-        free_chain=jnp.ones((knots, 6), dtype=bool),
+        free_chain=on_device(np.ones((knots, 6), dtype=bool)),
         free=on_device(free),
         loss_width=on_device(1.0),
         basis=own_parameters(lenses, layout),
@@ -109,12 +108,12 @@ def continuous_problem(
         R_cam_rig=on_device(np.stack(rotation)),
         t_cam_rig=on_device(np.stack(arms)),
         shift=on_device(shift),
-        gravity=jnp.array([0.0, 0.0, -1.0]),
+        gravity=on_device([0.0, 0.0, -1.0]),
         rotations=on_device(rotations),
         positions=on_device(positions),
-        biases=jnp.zeros((knots, 0)),
+        biases=on_device(np.zeros((knots, 0))),
         target=flat_target(layout),
-        line_delay=jnp.zeros(len(lenses) if layout.rolling else 0),
+        line_delay=on_device(np.zeros(len(lenses) if layout.rolling else 0)),
     )
     return Unsynchronised(problem, state, usable, grid)
 

@@ -15,6 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jaxcal.cameras.numerics import constant
 from jaxcal.errors import CalibrationError
 
 # Unprojection looks for its start among these angles (rad) from the axis, and goes on by Newton's method.
@@ -130,7 +131,7 @@ class CameraModel(eqx.Module):
 
         Zero for parameters that every usable recording determines: all those of a model that does not say otherwise.
         """
-        return jnp.zeros(self.num_parameters)
+        return constant(np.zeros(self.num_parameters))
 
     @classmethod
     def create(cls, intrinsics: Any, distortion: Any = ()) -> "CameraModel":

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.cameras.base import CameraModel
-from jaxcal.cameras.numerics import at_least, length, root
+from jaxcal.cameras.numerics import at_least, constant, first_pinhole, length, root
 
 
 class PinholeDivision(CameraModel):
@@ -52,12 +52,10 @@ class PinholeDivision(CameraModel):
 
     @classmethod
     def from_focal(cls, focal: float, image_size: tuple[int, int]) -> "CameraModel":
-        width, height = image_size
-        centre = jnp.array([(width - 1) / 2.0, (height - 1) / 2.0])
-        return cls(jnp.full(2, float(focal)), centre, jnp.asarray(0.0))
+        return cls(*first_pinhole(focal, image_size), constant(0.0))
 
     @classmethod
     def starts(cls, focal: float, image_size: tuple[int, int]) -> tuple["CameraModel", ...]:
         """A pinhole and a stereographic lens."""
         first = cls.from_focal(focal, image_size)
-        return tuple(eqx.tree_at(lambda m: m.bend, first, jnp.asarray(bend)) for bend in (0.0, -0.25))
+        return tuple(eqx.tree_at(lambda m: m.bend, first, constant(bend)) for bend in (0.0, -0.25))

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxcal.cameras.base import CameraModel
 from jaxcal.cameras.eucm import edge_ratio
-from jaxcal.cameras.numerics import at_least, length, root
+from jaxcal.cameras.numerics import at_least, constant, first_pinhole, length, root
 
 
 class DoubleSphere(CameraModel):
@@ -56,9 +56,7 @@ class DoubleSphere(CameraModel):
     @classmethod
     def from_focal(cls, focal: float, image_size: tuple[int, int]) -> "CameraModel":
         """Focal length at the image's centre in pixels; xi = 0, alpha = 1/2: a stereographic lens."""
-        width, height = image_size
-        centre = jnp.array([(width - 1) / 2.0, (height - 1) / 2.0])
-        return cls(jnp.asarray(0.0), jnp.asarray(0.5), jnp.full(2, float(focal)), centre)
+        return cls(constant(0.0), constant(0.5), *first_pinhole(focal, image_size))
 
     @classmethod
     def starts(cls, focal: float, image_size: tuple[int, int]) -> tuple["CameraModel", ...]:
@@ -69,7 +67,7 @@ class DoubleSphere(CameraModel):
             eqx.tree_at(
                 lambda m: (m.xi, m.alpha, m.focal),
                 first,
-                (jnp.asarray(xi), jnp.asarray(alpha), jnp.full(2, focal * (1.0 + xi))),
+                (constant(xi), constant(alpha), constant([focal * (1.0 + xi)] * 2)),
             )
             for xi, alpha in ((0.0, 0.5), (0.0, 0.2), (-0.2, 0.6), (0.25, 0.6))
         )

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.cameras.base import CameraModel
-from jaxcal.cameras.numerics import at_least, root
+from jaxcal.cameras.numerics import at_least, constant, first_pinhole, root
 
 
 class Eucm(CameraModel):
@@ -54,15 +54,13 @@ class Eucm(CameraModel):
     @classmethod
     def from_focal(cls, focal: float, image_size: tuple[int, int]) -> "CameraModel":
         """Focal length at the image's centre in pixels; alpha = 1/2, beta = 1: a stereographic lens."""
-        width, height = image_size
-        centre = jnp.array([(width - 1) / 2.0, (height - 1) / 2.0])
-        return cls(jnp.asarray(0.5), jnp.asarray(1.0), jnp.full(2, float(focal)), centre)
+        return cls(constant(0.5), constant(1.0), *first_pinhole(focal, image_size))
 
     @classmethod
     def starts(cls, focal: float, image_size: tuple[int, int]) -> tuple["CameraModel", ...]:
         """A stereographic lens, a weaker barrel and a stronger one."""
         first = cls.from_focal(focal, image_size)
-        return tuple(eqx.tree_at(lambda m: m.alpha, first, jnp.asarray(alpha)) for alpha in (0.5, 0.2, 0.75))
+        return tuple(eqx.tree_at(lambda m: m.alpha, first, constant(alpha)) for alpha in (0.5, 0.2, 0.75))
 
 
 def edge_ratio(alpha: Float[Array, ""]) -> Float[Array, ""]:

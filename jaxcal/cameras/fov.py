@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.cameras.base import CameraModel
-from jaxcal.cameras.numerics import length
+from jaxcal.cameras.numerics import constant, first_pinhole, length
 
 # From pinholes (w towards 0) the model differs by w^2 / 12 at most: smaller angles cannot be told from this one.
 _SMALLEST = 1e-4
@@ -51,7 +51,5 @@ class PinholeFov(CameraModel):
 
 
 def _with_angle(focal: float, image_size: tuple[int, int], w: float) -> PinholeFov:
-    width, height = image_size
     central = focal * w / (2.0 * math.tan(w / 2.0))
-    centre = jnp.array([(width - 1) / 2.0, (height - 1) / 2.0])
-    return PinholeFov(jnp.full(2, central), centre, jnp.asarray(w))
+    return PinholeFov(*first_pinhole(central, image_size), constant(w))

@@ -3,10 +3,11 @@
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.cameras.base import CameraModel
-from jaxcal.cameras.numerics import length, rises_until
+from jaxcal.cameras.numerics import constant, first_pinhole, length, rises_until
 
 
 class PinholeEquidistant(CameraModel):
@@ -41,6 +42,4 @@ class PinholeEquidistant(CameraModel):
 
     @classmethod
     def from_focal(cls, focal: float, image_size: tuple[int, int]) -> "CameraModel":
-        width, height = image_size
-        centre = jnp.array([(width - 1) / 2.0, (height - 1) / 2.0])
-        return cls(focal=jnp.full(2, float(focal)), centre=centre, coefficients=jnp.zeros(4))
+        return cls(*first_pinhole(focal, image_size), coefficients=constant(np.zeros(4)))

@@ -1,14 +1,28 @@
 """Square roots and quotients whose values and gradients stay finite everywhere, and the test for a fold."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 # Added under roots of squared metres: without effect on points more than a micrometre away, finite gradients at zero.
 _TINY = 1e-24
 _FOLD_SAMPLES = 32
+
+
+def constant(values: Any) -> Float[Array, "..."]:
+    """Known numbers as an array of the device. `jnp.full` and its like compile a program for each shape: half a second
+    of a calibration that else needs one."""
+    return jax.device_put(np.asarray(values, dtype=np.float64))
+
+
+def first_pinhole(focal: float, image_size: tuple[int, int]) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+    """Focal lengths (2,) in pixels, equal, and the image's centre (2,): pixel centres have whole numbers."""
+    width, height = image_size
+    return constant([focal, focal]), constant([(width - 1) / 2.0, (height - 1) / 2.0])
 
 
 def root(value: Float[Array, ""]) -> Float[Array, ""]:

@@ -4,11 +4,12 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.cameras import distortions
 from jaxcal.cameras.base import CameraModel
-from jaxcal.cameras.numerics import at_least, keeps_orientation, length, rises_until, root
+from jaxcal.cameras.numerics import at_least, constant, first_pinhole, keeps_orientation, length, rises_until, root
 
 
 class OmniModel(CameraModel):
@@ -45,20 +46,15 @@ class OmniModel(CameraModel):
     @classmethod
     def from_focal(cls, focal: float, image_size: tuple[int, int]) -> "CameraModel":
         """Focal length at the image's centre in pixels; xi = 1: a stereographic lens, so fx is twice that."""
-        width, height = image_size
-        return cls(
-            xi=jnp.asarray(1.0),
-            focal=jnp.full(2, 2.0 * focal),
-            centre=jnp.array([(width - 1) / 2.0, (height - 1) / 2.0]),
-            coefficients=jnp.zeros(len(cls.distortion_names)),
-        )
+        middle = first_pinhole(2.0 * focal, image_size)
+        return cls(constant(1.0), *middle, coefficients=constant(np.zeros(len(cls.distortion_names))))
 
     @classmethod
     def starts(cls, focal: float, image_size: tuple[int, int]) -> tuple["CameraModel", ...]:
         """From nearly a pinhole (small xi) to the strongest barrel."""
         first = cls.from_focal(focal, image_size)
         return tuple(
-            eqx.tree_at(lambda m: (m.xi, m.focal), first, (jnp.asarray(xi), jnp.full(2, focal * (1.0 + xi))))
+            eqx.tree_at(lambda m: (m.xi, m.focal), first, (constant(xi), constant([focal * (1.0 + xi)] * 2)))
             for xi in (1.0, 0.3, 2.0)
         )
 

@@ -4,11 +4,12 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.cameras import distortions
 from jaxcal.cameras.base import CameraModel
-from jaxcal.cameras.numerics import at_least, keeps_orientation, length, rises_until
+from jaxcal.cameras.numerics import at_least, constant, first_pinhole, keeps_orientation, length, rises_until
 
 # Closer to the image plane than this angle (rad) nothing is projected: pixels there are a million focal lengths out.
 _RIM = 1e-6
@@ -52,12 +53,8 @@ class PinholeModel(CameraModel):
 
     @classmethod
     def from_focal(cls, focal: float, image_size: tuple[int, int]) -> "CameraModel":
-        width, height = image_size
-        return cls(
-            focal=jnp.full(2, float(focal)),
-            centre=jnp.array([(width - 1) / 2.0, (height - 1) / 2.0]),
-            coefficients=jnp.zeros(len(cls.distortion_names)),
-        )
+        middle = first_pinhole(focal, image_size)
+        return cls(*middle, coefficients=constant(np.zeros(len(cls.distortion_names))))
 
 
 class Pinhole(PinholeModel):

@@ -8,10 +8,11 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.cameras.base import CameraModel
-from jaxcal.cameras.numerics import at_least, keeps_orientation, length
+from jaxcal.cameras.numerics import at_least, constant, first_pinhole, keeps_orientation, length
 from jaxcal.errors import CalibrationError
 
 _SHORT_NAME = re.compile(r"splined-(\d+)-(\d+)-(\d+)-(\d+(?:\.\d+)?)")
@@ -88,14 +89,12 @@ class SplinedStereographic(CameraModel):
         A knot is seen by the corners of a few cells only. Where there are none nothing else would determine it; where
         there are some the prior weighs less than one corner with an error of a focal length.
         """
-        return jnp.concatenate([jnp.zeros(4), jnp.full(self.knots.size, _KNOT_SIGMA**-2)])
+        return constant(np.append(np.zeros(4), np.full(self.knots.size, _KNOT_SIGMA**-2)))
 
     @classmethod
     def from_focal(cls, focal: float, image_size: tuple[int, int]) -> "CameraModel":
         """Focal length at the image's centre in pixels; a flat surface, so a stereographic lens."""
-        width, height = image_size
-        centre = jnp.array([(width - 1) / 2.0, (height - 1) / 2.0])
-        return cls(jnp.full(2, float(focal)), centre, jnp.zeros((*cls.shape, 2)))
+        return cls(*first_pinhole(focal, image_size), constant(np.zeros((*cls.shape, 2))))
 
 
 @functools.lru_cache

@@ -1,6 +1,8 @@
 """The `jaxcal` command: one file per subcommand, heavy imports inside them so that help comes at once."""
 
+import atexit
 import difflib
+import gc
 from typing import Any
 
 import click
@@ -93,6 +95,8 @@ class _Commands(click.Group):
 @click.version_option(package_name="jaxcal")
 def main() -> None:
     """The command line."""
+    # At its end Python looks for cycles in all that jax and the others have brought: half a second after the result.
+    atexit.register(gc.freeze)
 
 
 main.add_command(target)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxcal.estimation.arrays import on_device
 from jaxcal.estimation.block_arrow import BlockArrow
 from jaxcal.estimation.descent import BlockArrowDescent, BlockStep
 from jaxcal.estimation.problem import BlockArrowProblem, State
@@ -240,7 +241,7 @@ def solve(
     solver = solver or BlockArrowLevenbergMarquardt()
     with single_threaded_blas():
         # Limits are data of the program, so that calls with other ones need not compile another one.
-        limits = {"max_steps": jnp.asarray(max_steps), "rtol": jnp.asarray(rtol), "damping": jnp.asarray(damping)}
+        limits = {"max_steps": on_device(max_steps), "rtol": on_device(rtol), "damping": on_device(damping)}
         return jax.block_until_ready(_solve(problem, state, solver=solver, **limits, adjoint=adjoint))
 
 
