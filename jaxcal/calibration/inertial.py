@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxcal.calibration.inertial_calibrated import reduce_batch
 from jaxcal.calibration.state import RigState, SharedLayout
+from jaxcal.estimation import on_device
 from jaxcal.imu import imu_model, respond
 from jaxcal.trajectory import Increments, basis_matrix, increments, rotation_at, so3, weights
 
@@ -46,8 +47,8 @@ class InertialData(eqx.Module):
     samples: tuple[ImuSamples, ...]
     start: Float[Array, ""]
     dt: Float[Array, ""]
-    rate_sigma: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(RATE_SIGMA))
-    acceleration_sigma: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(ACCELERATION_SIGMA))
+    rate_sigma: Float[Array, ""] = eqx.field(default_factory=lambda: on_device(RATE_SIGMA))
+    acceleration_sigma: Float[Array, ""] = eqx.field(default_factory=lambda: on_device(ACCELERATION_SIGMA))
 
     @property
     def walk_sigma(self) -> Float[Array, " b"]:

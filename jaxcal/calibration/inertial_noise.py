@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from jaxcal.calibration import inertial
@@ -13,6 +13,7 @@ from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.robust import RobustFit
 from jaxcal.calibration.spline_setup import BinnedImu, SplineGrid
 from jaxcal.calibration.state import RigState
+from jaxcal.estimation import on_device
 from jaxcal.programs import stored_jit
 
 # Noise below this share of the stated one is not believed: the spline would have followed it.
@@ -26,7 +27,7 @@ NoiseChoice = Literal["at least given", "given", "estimated"]
 
 
 @stored_jit
-def _whitened(problem: RigProblem, state: RigState, imu: int) -> jnp.ndarray:
+def _whitened(problem: RigProblem, state: RigState, imu: int) -> jax.Array:
     assert problem.imu is not None
     return inertial.imu_residuals(state, problem.imu, problem.order, problem.layout, imu)
 
@@ -52,7 +53,7 @@ class NoiseModel:
         """Residuals (M, 6) in units of the stated noise, and the share of them that the spline leaves free."""
         assert problem.imu is not None
         samples = problem.imu.samples[imu]
-        scale = np.asarray(self.binned[imu].samples.inverse_sigma / samples.inverse_sigma)
+        scale = np.asarray(self.binned[imu].samples.inverse_sigma) / np.asarray(samples.inverse_sigma)
         residuals = (np.asarray(_whitened(problem, state, imu)) * scale)[np.asarray(samples.present) > 0]
         # The spline's freedoms are shared by all IMUs that see it.
         count = sum(len(one.index) for one in self.binned)
@@ -68,10 +69,10 @@ class NoiseModel:
         assert problem.imu is not None
         samples = list(problem.imu.samples)
         for i in range(len(samples)):
-            stated = self.binned[i].at_shift(self.grid, float(state.imu_shift[i])).samples
+            stated = self.binned[i].at_shift(self.grid, float(np.asarray(state.imu_shift)[i])).samples
             ratio = np.ones(2) if self.choice == "given" else self._ratio(problem, state, i)
             ratio = np.maximum(ratio, 1.0 if self.choice == "at least given" else _SMALLEST_RATIO)
-            inverse = stated.inverse_sigma / jnp.asarray(np.repeat(ratio, 3))
+            inverse = on_device(np.asarray(stated.inverse_sigma) / np.repeat(ratio, 3))
             samples[i] = eqx.tree_at(lambda s: s.inverse_sigma, stated, inverse)
         return eqx.tree_at(lambda p: p.imu.samples, problem, tuple(samples))
 

@@ -257,14 +257,18 @@ class RigState(eqx.Module):
 
 
 def tangent_basis(vector: Float[Array, "3"]) -> Float[Array, "3 2"]:
-    """Two orthonormal directions across `vector`, smooth in it except at one pole (Duff et al. 2017, listing 3)."""
-    x, y, z = vector / jnp.linalg.norm(vector)
-    sign = jnp.where(z >= 0, 1.0, -1.0)
+    """Two orthonormal directions across `vector`, smooth in it except at one pole (Duff et al. 2017, listing 3).
+
+    By numpy for its arrays: jax would compile each operation by itself.
+    """
+    xp = vector.__array_namespace__()
+    x, y, z = vector / xp.linalg.vector_norm(vector)
+    sign = xp.where(z >= 0, 1.0, -1.0)
     a = -1.0 / (sign + z)
     b = x * y * a
-    first = jnp.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
-    second = jnp.stack([b, sign + y * y * a, -y])
-    return jnp.stack([first, second], axis=1)
+    first = xp.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
+    second = xp.stack([b, sign + y * y * a, -y])
+    return xp.stack([first, second], axis=1)
 
 
 def transform(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

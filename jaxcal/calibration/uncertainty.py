@@ -179,7 +179,7 @@ def named_jacobian(
             rows.append(identity[[layout.line_delay(c)]])
     if with_imu:
         blocks.append(("gravity", 3))
-        rows.append(np.asarray(layout.gravity_basis(state.gravity)) @ identity[layout.gravity])
+        rows.append(np.asarray(layout.gravity_basis(np.asarray(state.gravity))) @ identity[layout.gravity])
     for number, imu in enumerate(layout.imus):
         own = identity[layout.imu(number)]
         for block, entries in imu_model(imu.model).blocks:
