@@ -25,8 +25,10 @@ _BEYOND_CHANCE = 5.0
 # Of lenses with very many parameters so many are looked at, evenly chosen.
 _MOST_PARAMETERS = 24
 _FEWEST_VIEWS = 8
-# Stretches of the recording that are left out in turn.
-STRETCHES = 12
+# Stretches of the recording that are left out in turn. Of more and shorter ones each errs like its neighbours: with 12
+# (of 10 s) errors of lenses from events were 1.15 sigma, 1.34 with 24, 1.01 with these; fewer say little for sure.
+STRETCHES = 8
+_CUTS = 3
 # A direction that one stretch alone tells is not known without it; its step is held to the inverse of this share.
 LEAST_LEFT = 0.1
 _FEWEST_CORNERS = 6
@@ -150,13 +152,20 @@ def _beyond_chance(scores: np.ndarray, expected: np.ndarray) -> bool:
 
 
 def _jackknife(scores: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Covariance (D, D) of the sum of scores from how the optimum moves when stretches of the views are left out."""
-    stretches = np.array_split(np.arange(len(scores)), min(STRETCHES, len(scores)))
+    """Covariance (D, D) of the sum of scores from how the optimum moves when stretches of the views are left out.
+
+    The mean over three ways to cut the recording, as a ring, into stretches (overlapping blocks, Kuensch 1989): so few
+    stretches would tell of fewer directions than a lens has.
+    """
+    count = min(STRETCHES, len(scores))
+    views = np.arange(len(scores))
+    starts = {len(scores) * cut // (_CUTS * count) for cut in range(_CUTS)}
+    stretches = [part for start in starts for part in np.array_split(np.roll(views, -start), count)]
     left, vectors = np.linalg.eigh(np.eye(scores.shape[1]) - np.stack([expected[s].sum(axis=0) for s in stretches]))
     own = np.stack([scores[s].sum(axis=0) for s in stretches])
     turned = np.einsum("sij,si->sj", vectors, own) / np.maximum(left, LEAST_LEFT)
     moved = np.einsum("sij,sj->si", vectors, turned)
-    return (1.0 - 1.0 / len(stretches)) * moved.T @ moved
+    return (1.0 - 1.0 / count) / len(starts) * moved.T @ moved
 
 
 def _derivatives(model: CameraModel, chosen: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,8 @@ from jaxcal.cameras import CameraModel
 from jaxcal.estimation import on_device
 from jaxcal.trajectory import so3
 
+_Array = Array | np.ndarray
+
 
 @dataclass(frozen=True)
 class ImuPlace:
@@ -112,7 +114,7 @@ class SharedLayout:
         """Where the line delay of a camera with a rolling shutter stands."""
         return self.gravity.stop + sum(self.rolling[:camera])
 
-    def gravity_basis(self, gravity: Float[Array, "3"]) -> Float[Array, "3 g"]:
+    def gravity_basis(self, gravity: Float[_Array, "3"]) -> Float[_Array, "3 g"]:
         """Directions in which gravity may move: two across it, or all three."""
         return tangent_basis(gravity) if self.gravity_size == 2 else jnp.eye(3)
 
@@ -256,7 +258,7 @@ class RigState(eqx.Module):
         return jnp.stack([shared[layout.line_delay(c)] if layout.is_rolling(c) else zero for c in cameras])
 
 
-def tangent_basis(vector: Float[Array, "3"]) -> Float[Array, "3 2"]:
+def tangent_basis(vector: Float[_Array, "3"]) -> Float[_Array, "3 2"]:
     """Two orthonormal directions across `vector`, smooth in it except at one pole (Duff et al. 2017, listing 3).
 
     By numpy for its arrays: jax would compile each operation by itself.
