@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxcal.calibration.assemble import CameraFrames, split_groups, stack_weights
 from jaxcal.calibration.robust import RobustFit
-from jaxcal.calibration.score_noise import LEAST_LEFT, STRETCHES
+from jaxcal.calibration.score_noise import LEAST_LEFT, STRETCHES, of_few, usual_effect
 from jaxcal.calibration.uncertainty import UNOBSERVED, shared_information
 from jaxcal.estimation import BlockArrow, factorise, single_threaded_blas, solve
 from jaxcal.programs import stored_jit
@@ -33,7 +33,7 @@ _LITTLE, _HARDLY_DAMPED = 1e-3, 1e-12
 class Wandering:
     """How far the errors of one camera's corners lead the shared parameters astray.
 
-    `effect`: the mean, over the directions that the camera tells, of the variance beside that of independent corners;
+    `effect`: the usual variance of the directions that the camera tells, beside that of independent corners;
     `directions` (P, D), each of a length of one standard deviation were corners independent; `variance` (D,) beside
     that.
     """
@@ -44,7 +44,7 @@ class Wandering:
 
     def beyond(self, allowed: float) -> np.ndarray:
         """Covariance (P, P) of the shared parameters to be added where corners count as if independent, of `allowed`
-        times the variance. No direction is taken to be known better than they are in the mean."""
+        times the variance. No direction is taken to be known better than is usual."""
         more = np.maximum(np.maximum(self.variance, self.effect) - allowed, 0.0)
         return (self.directions * more) @ self.directions.T
 
@@ -84,10 +84,10 @@ def wandering(fit: RobustFit, cameras: Sequence[CameraFrames], camera: int) -> W
         expected += (along * (np.maximum(values, 0.0) / known_without * (1.0 - values))) @ along.T
     usual, turned = np.linalg.eigh(expected)
     beside = np.stack(moved) @ (turned / np.sqrt(np.maximum(usual, 1e-6))) @ turned.T
-    variance, turned = np.linalg.eigh(beside.T @ beside)
+    variance, turned = np.linalg.eigh(of_few(STRETCHES - 1.0) * beside.T @ beside)
     full = np.zeros((len(fit.problem.free), len(variance)))
     full[free] = whitened @ (axes * root) @ turned
-    return Wandering(max(float(variance.mean()), 1.0), full, variance)
+    return Wandering(usual_effect(variance), full, variance)
 
 
 def corner_weights(fit: RobustFit, cameras: Sequence[CameraFrames]) -> list[np.ndarray]:

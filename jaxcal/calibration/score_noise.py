@@ -25,10 +25,11 @@ _BEYOND_CHANCE = 5.0
 # Of lenses with very many parameters so many are looked at, evenly chosen.
 _MOST_PARAMETERS = 24
 _FEWEST_VIEWS = 8
-# Stretches of the recording that are left out in turn. Of more and shorter ones each errs like its neighbours: with 12
-# (of 10 s) errors of lenses from events were 1.15 sigma, 1.34 with 24, 1.01 with these; fewer say little for sure.
+# Stretches of the recording that are left out in turn. Of more and shorter ones each errs like its neighbours: errors
+# of lenses from events were 1.34, 1.15 and 1.01 sigma with 24, 12 and 8 of 10 s. Fewer say little for sure.
 STRETCHES = 8
 _CUTS = 3
+_MORE_FREEDOM = 1.5  # that these give, as overlapping blocks do
 # A direction that one stretch alone tells is not known without it; its step is held to the inverse of this share.
 LEAST_LEFT = 0.1
 _FEWEST_CORNERS = 6
@@ -40,7 +41,7 @@ _SAME_POSE = 1e-12  # of the information on a pose: corners in a line leave a tu
 class ScoreNoise:
     """How the score of a lens scatters.
 
-    `effect`: the mean over directions of its variance beside that of independent corners, 1 where these are so;
+    `effect`: the usual variance of a direction beside that of independent corners, 1 where these are so;
     `scatter` (D, D): its covariance in the coordinates in which that of independent corners is the identity;
     `directions` (P, D): from these coordinates to derivatives of the cost by the lens's parameters.
     """
@@ -51,7 +52,7 @@ class ScoreNoise:
 
     def beyond(self, effect: float) -> np.ndarray:
         """Covariance (P, P) of the score where it scatters by more than `effect` times what independent corners show:
-        in a few directions it may be far more than in the mean."""
+        in a few directions it may be far more than usual."""
         values, vectors = np.linalg.eigh(self.scatter)
         along = self.directions @ vectors
         return (along * np.maximum(values - effect, 0.0)) @ along.T
@@ -62,7 +63,7 @@ def design_effect(
 ) -> float:
     """By what factor the covariance of a lens is larger than its information says; 1 where corners are independent.
 
-    The mean over the directions of the lens (Kish's design effect). Arguments as for `score_noise`.
+    The usual one of the directions of the lens (Kish's design effect). Arguments as for `score_noise`.
     """
     found = score_noise(model, points, poses, errors, weights)
     return 1.0 if found is None else found.effect
@@ -99,10 +100,21 @@ def score_noise(
     scores, of_views = scores @ whitened, whitened.T @ of_views @ whitened
     if not _beyond_chance(scores, of_views):
         return None
-    scatter = _jackknife(scores, of_views)
+    scatter = of_few(_MORE_FREEDOM * (STRETCHES - 1)) * _jackknife(scores, of_views)
     directions = np.zeros((len(np.asarray(model.parameters)), len(scatter)))
     directions[chosen] = information @ whitened
-    return ScoreNoise(max(float(np.trace(scatter)) / len(scatter), 1.0), scatter, directions)
+    return ScoreNoise(usual_effect(np.linalg.eigvalsh(scatter)), scatter, directions)
+
+
+def of_few(freedom: float) -> float:
+    """By how much a variance estimated with so many degrees of freedom has to be larger for it: Student's t."""
+    return freedom / (freedom - 2.0)
+
+
+def usual_effect(variances: np.ndarray) -> float:
+    """The mean of variances in rising order, at least 1, without the largest: a direction in which the lens model does
+    not fit may scatter by a hundred times as much as all others, and would be taken for what they do."""
+    return max(float(np.mean(variances[:-1])), 1.0) if len(variances) > 1 else max(float(variances[0]), 1.0)
 
 
 def _chosen(model: CameraModel) -> np.ndarray:
