@@ -1,6 +1,7 @@
 """Shared fixtures: the real recordings, and loud deselection of their tests where they are absent."""
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,6 +23,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    _slow_files_first(items)
     if _data_folder() is not None:
         return
     real = [item for item in items if item.get_closest_marker("real_data")]
@@ -29,6 +31,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=real)
         items[:] = [item for item in items if not item.get_closest_marker("real_data")]
         config.stash[_DESELECTED] = len(real)
+
+
+def _slow_files_first(items: list[pytest.Item]) -> None:
+    """Files stay whole, those with most slow tests in front: a long file that comes last leaves the other process idle
+    (pytest-xdist's own order, by the number of tests of any kind, has them last)."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 _DESELECTED = pytest.StashKey[int]()
