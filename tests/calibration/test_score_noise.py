@@ -102,7 +102,7 @@ def test_a_direction_that_scatters_more_than_the_others_is_told() -> None:
         _, information = _scores(LENS, np.arange(8), POINTS, T, errors, weights(len(T)))
         true.append(1.0 + np.sum((change * information[:, :, 4] @ covariance) ** 2, axis=0) / usual)
     said, is_so = np.mean(told, axis=0), np.mean(true, axis=0)
-    assert (said > is_so).all()  # no direction is taken to be better known than they are in the mean
+    assert (said > is_so).all()  # no direction is taken to be better known than is usual
     assert said.argmax() == is_so.argmax() == 5  # k2, which goes with k1
     assert said[5] > 1.5 * said[:4].max()
     assert said[5] < 4.0 * is_so[5]
