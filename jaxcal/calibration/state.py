@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -13,7 +14,7 @@ from jaxcal.cameras import CameraModel
 from jaxcal.estimation import on_device
 from jaxcal.trajectory import so3
 
-_Array = Array | np.ndarray
+_Array = TypeVar("_Array", Array, np.ndarray)
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ class SharedLayout:
         """Where the line delay of a camera with a rolling shutter stands."""
         return self.gravity.stop + sum(self.rolling[:camera])
 
-    def gravity_basis(self, gravity: Float[_Array, "3"]) -> Float[_Array, "3 g"]:
+    def gravity_basis(self, gravity: Float[Array, "3"]) -> Float[Array, "3 g"]:
         """Directions in which gravity may move: two across it, or all three."""
         return tangent_basis(gravity) if self.gravity_size == 2 else jnp.eye(3)
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcal.calibration.state import RigState, SharedLayout
+from jaxcal.calibration.state import RigState, SharedLayout, tangent_basis
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
 from jaxcal.estimation import BlockArrow, factorise, single_threaded_blas
@@ -179,7 +179,8 @@ def named_jacobian(
             rows.append(identity[[layout.line_delay(c)]])
     if with_imu:
         blocks.append(("gravity", 3))
-        rows.append(np.asarray(layout.gravity_basis(np.asarray(state.gravity))) @ identity[layout.gravity])
+        gravity = np.asarray(state.gravity)
+        rows.append((tangent_basis(gravity) if layout.gravity_size == 2 else np.eye(3)) @ identity[layout.gravity])
     for number, imu in enumerate(layout.imus):
         own = identity[layout.imu(number)]
         for block, entries in imu_model(imu.model).blocks:
