@@ -211,7 +211,7 @@ class Plane:
         """The image, with its padding, in float32."""
         padded = _pad(voxels[None], self.padding, self.network.padding)
         precision: AbstractContextManager = nullcontext()
-        if self.network.reduced_precision:  # one of ours; up to four times as quick in this layout
+        if self.network.channels_last_input:  # up to four times as quick
             padded = padded.contiguous(memory_format=torch.channels_last)
         if self.dtype is not None:
             precision = torch.autocast(self.device_type, self.dtype)

@@ -101,12 +101,14 @@ class RunningScale:
     def __init__(self) -> None:
         self.events = 1.0
 
-    def __call__(self, grid: Float[np.ndarray, "bins height width"]) -> Float[np.ndarray, "bins height width"]:
+    def __call__(
+        self, grid: Float[np.ndarray, "bins height width"], out: np.ndarray | None = None
+    ) -> Float[np.ndarray, "bins height width"]:
         net = np.rint(np.abs(grid.sum(axis=0))).astype(np.int64).ravel()
         weight = np.cumsum(np.bincount(net) * np.arange(net.max(initial=0) + 1))
         median = float(np.searchsorted(weight, 0.5 * weight[-1])) if weight[-1] else 0.0
         self.events = max(median, _FADING * self.events, 1.0)
-        return (grid * np.float32(_GAIN / self.events)).astype(np.float32)
+        return np.multiply(grid, np.float32(_GAIN / self.events), out=out, dtype=np.float32)
 
 
 class RunningAndScale:
@@ -120,12 +122,17 @@ class RunningAndScale:
         self._scale = RunningScale()
 
     def __call__(self, grid: Float[np.ndarray, "bins height width"]) -> Float[np.ndarray, "planes height width"]:
-        return self.beside(self._scale(grid))
+        planes = np.empty((len(grid) + 1, *grid.shape[1:]), dtype=np.float32)
+        self._scale(grid, out=planes[:-1])
+        planes[-1] = self._plane()
+        return planes
 
     def beside(self, grid: Float[np.ndarray, "bins height width"]) -> Float[np.ndarray, "planes height width"]:
         """A grid and the plane as of the last call."""
-        plane = np.full((1, *grid.shape[1:]), 0.5 * np.log(self._scale.events), dtype=np.float32)
-        return np.concatenate([grid, plane])
+        return np.concatenate([grid, np.full((1, *grid.shape[1:]), self._plane(), dtype=np.float32)])
+
+    def _plane(self) -> float:
+        return 0.5 * float(np.log(self._scale.events))
 
 
 def scaler(scaling: str) -> Callable[[np.ndarray], np.ndarray]:

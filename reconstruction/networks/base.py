@@ -15,17 +15,18 @@ class ReconstructionNetwork(nn.Module, abc.ABC):
 
     `num_bins` time bins of the voxel grid it reads; `multiple`: input height and width must be divisible by it;
     `settings`: the numbers and names it was built from, as they stand in a checkpoint; `reduced_precision`: whether
-    it was trained to work in bfloat16; `scaling` of the voxel grids that it was trained on: 'window' (each brought to
-    mean 0 and deviation 1, as E2VID's), 'running' (`reconstruction.voxel.RunningScale`), 'running+scale' (with a
-    further plane: `reconstruction.voxel.RunningAndScale`) or 'none'; `padding`: what surrounds an input that is too
-    small, 'reflect' or 'zeros'; `shown_at`: which moment of the window the image shows, from 0 (its start)
-    to 1 (its end, as E2VID's).
+    it was trained to work in bfloat16; `channels_last_input`: whether it is quickest on that layout; `scaling` of the
+    voxel grids that it was trained on: 'window' (each brought to mean 0 and deviation 1, as E2VID's), 'running'
+    (`reconstruction.voxel.RunningScale`), 'running+scale' (with a further plane: `voxel.RunningAndScale`)
+    or 'none'; `padding`: what surrounds an input that is too small, 'reflect' or 'zeros'; `shown_at`: which moment of
+    the window the image shows, from 0 (its start) to 1 (its end, as E2VID's).
     """
 
     num_bins: int
     multiple: int
     settings: dict[str, Any]
     reduced_precision: bool = False
+    channels_last_input: bool = False
     scaling: str = "window"
     padding: str = "reflect"
     shown_at: float = 1.0

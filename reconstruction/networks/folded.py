@@ -16,6 +16,7 @@ class FoldedFireNet(ReconstructionNetwork):
     """
 
     reduced_precision = True
+    channels_last_input = True
 
     def __init__(
         self,
