@@ -14,8 +14,10 @@ _FOLD_SAMPLES = 32
 
 
 def constant(values: Any) -> Float[Array, "..."]:
-    """Known numbers as an array of the device. `jnp.full` and its like compile a program for each shape: half a second
-    of a calibration that else needs one."""
+    """Known numbers as an array of the device, in double precision.
+
+    `jnp.full` and its like compile a program for each shape, in every process anew: half a second in all.
+    """
     return jax.device_put(np.asarray(values, dtype=np.float64))
 
 
