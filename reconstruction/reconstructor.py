@@ -162,7 +162,7 @@ class Reconstructor:
             return self._voxels_on_gpu(
                 voxel_torch.accumulate(x, y, t_us, p, **size, device=self.device, span=span), raw
             )
-        grid = accumulate(x, y, t_us, p, **size, span=span)
+        grid = accumulate(x, y, t_us, p, **size, span=span, threads=torch.get_num_threads())
         if self._working_cells is not None:
             grid = grid * self._working_cells
         if self.flip:

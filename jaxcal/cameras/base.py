@@ -44,6 +44,8 @@ class CameraModel(eqx.Module):
     `held` are the places in the parameter vector that are never estimated, because others stand for them.
     `usual_spread` may name parameters that recordings often leave open, with the 1-sigma of the values that they
     usually take about those of `from_focal`: far wider than what a good recording says, and all there is in a poor one.
+    `two_fold` may name parameters that others stand in for but to second order (the tilt of a sensor): their optimum
+    may have a mirror image, which is then looked for.
     """
 
     name: ClassVar[str] = ""
@@ -52,6 +54,7 @@ class CameraModel(eqx.Module):
     distortion_names: ClassVar[tuple[str, ...]] = ()
     held: ClassVar[tuple[int, ...]] = ()
     usual_spread: ClassVar[Mapping[str, float]] = MappingProxyType({})
+    two_fold: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

@@ -131,6 +131,7 @@ class PinholeTilted14(PinholeModel):
     name: ClassVar[str] = "pinhole-tilted14"
     distortion_names: ClassVar[tuple[str, ...]] = (*PinholeThinPrism12.distortion_names, "tau_x", "tau_y")
     usual_spread: ClassVar[Mapping[str, float]] = {**PinholeThinPrism12.usual_spread, "tau_x": 0.05, "tau_y": 0.05}
+    two_fold: ClassVar[tuple[str, ...]] = ("tau_x", "tau_y")
 
     def _distort(self, plane: Float[Array, "2"]) -> Float[Array, "2"]:
         return distortions.tilted14(plane, self.coefficients)

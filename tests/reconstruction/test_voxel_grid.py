@@ -47,6 +47,25 @@ def test_order_of_events_does_not_matter(window: tuple[np.ndarray, ...], seed: i
 
 
 @settings(deadline=None, max_examples=60)
+@given(events(min_size=1), st.integers(1, 6), st.sampled_from([1, 3]), st.booleans())
+def test_cells_are_summed_to_the_bit_as_the_reference_does(
+    window: tuple[np.ndarray, ...], bins: int, threads: int, shuffled: bool
+):
+    """One event after the other in single precision: shares of the bins below first, then of those above."""
+    order = np.random.default_rng(0).permutation(len(window[0])) if shuffled else np.arange(len(window[0]))
+    x, y, t, p = (values[order] for values in window)
+    position = (bins - 1) * (t - t.min()).astype(float) / (float(t.max() - t.min()) or 1.0)
+    below = np.minimum(position.astype(int), max(bins - 2, 0))
+    expected = np.zeros((bins, HEIGHT, WIDTH), dtype=np.float32)
+    for above in range(2 if bins > 1 else 1):
+        for i in range(len(t)):
+            share = position[i] - below[i] if above else 1.0 - (position[i] - below[i])
+            cell = (below[i] + above, y[i], x[i])
+            expected[cell] = np.float32(np.float64(expected[cell]) + (share if p[i] else -share))
+    np.testing.assert_array_equal(accumulate(x, y, t, p, **SIZE, num_bins=bins, threads=threads), expected)
+
+
+@settings(deadline=None, max_examples=60)
 @given(events(min_size=1), st.integers(1, 59))
 def test_grids_of_parts_add_up_when_they_span_the_same_time(window: tuple[np.ndarray, ...], cut: int):
     """Linear before normalisation: each part is completed by the first and last event, which then count twice."""
@@ -192,6 +211,12 @@ def test_window_time_puts_the_shown_moment_where_the_network_expects_it(places: 
     assert time[:3] == pytest.approx([0.0, at, 1.0], abs=1e-9)
     assert np.all(np.diff(time[3:]) >= 0)
     assert np.all((time >= 0) & (time <= 1))
+
+
+@pytest.mark.parametrize("span", [(5, 5, 5), (5, 5, 9), (5, 9, 9), (0, 5, 9)])
+def test_window_time_of_parts_without_length_is_that_of_linear_interpolation(span: tuple[float, float, float]):
+    t_us = np.array([3, 5, 6, 8, 9, 12])
+    np.testing.assert_array_equal(window_time(t_us, span, 0.5)[0], np.interp(t_us, span, [0.0, 0.5, 1.0]))
 
 
 def test_networks_that_show_the_end_get_times_as_they_are():
