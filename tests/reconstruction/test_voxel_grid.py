@@ -213,7 +213,7 @@ def test_window_time_puts_the_shown_moment_where_the_network_expects_it(places: 
     assert np.all((time >= 0) & (time <= 1))
 
 
-@pytest.mark.parametrize("span", [(5, 5, 5), (5, 5, 9), (5, 9, 9), (0, 5, 9)])
+@pytest.mark.parametrize("span", [(5.0, 5.0, 5.0), (5.0, 5.0, 9.0), (5.0, 9.0, 9.0), (0.0, 5.0, 9.0)])
 def test_window_time_of_parts_without_length_is_that_of_linear_interpolation(span: tuple[float, float, float]):
     t_us = np.array([3, 5, 6, 8, 9, 12])
     np.testing.assert_array_equal(window_time(t_us, span, 0.5)[0], np.interp(t_us, span, [0.0, 0.5, 1.0]))
