@@ -2,7 +2,9 @@
 
 Corners touch poses alone, an IMU's sample its own biases besides. Both are summed by themselves and brought
 into the band last: windows padded to all coordinates of a chain block are ten times the memory, and moving that was
-most of the time of an iteration.
+most of the time of an iteration. With IMUs a block of the chain holds the control points of k - 1 knot intervals, k the
+spline's order, and one set of biases, for these hardly change in so short a time: with biases at every control point
+the factorisation took three times as long.
 """
 
 from collections.abc import Sequence
@@ -13,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.calibration.inertial import (
+    ChainPrior,
     InertialData,
     IntervalEquations,
     linearise_imu,
@@ -20,7 +23,14 @@ from jaxcal.calibration.inertial import (
     linearise_prior,
 )
 from jaxcal.calibration.state import RigState, SharedLayout
-from jaxcal.estimation import BlockArrow, band_from_windows, chain_from_windows, sum_along_chain
+from jaxcal.estimation import (
+    BlockArrow,
+    band_from_windows,
+    chain_from_windows,
+    gathered_band,
+    gathered_chain,
+    sum_along_chain,
+)
 
 
 class PoseEquations(eqx.Module):
@@ -58,9 +68,10 @@ def with_imus(
     """Equations of cameras and IMUs: samples, the motion prior, the biases' random walk, and what is usual of an IMU's
     parameters."""
     imus = [linearise_imu(state, data, order, layout, i) for i in range(len(layout.imus))]
-    prior = linearise_prior(state, data)
-    poses, gradient, cost = corners.band, corners.gradient, corners.cost + prior.cost
-    corner, gradient_shared = corners.corner, corners.gradient_shared
+    prior = linearise_prior(state, data, order)
+    missing = [(0, 0), (0, order - prior.band.shape[1]), (0, 0), (0, 0)]
+    poses, gradient = corners.band + jnp.pad(prior.band, missing), corners.gradient + prior.gradient
+    corner, gradient_shared, cost = corners.corner, corners.gradient_shared, corners.cost + prior.cost
     for i, imu in enumerate(imus):
         usual = linearise_model_prior(state, layout, i)
         own, columns = layout.imu(i), np.r_[layout.imu(i), layout.gravity]
@@ -69,65 +80,106 @@ def with_imus(
         gradient_shared = gradient_shared.at[columns].add(imu.gradient_shared).at[own].add(usual.gradient)
         cost = cost + imu.cost + usual.cost
 
-    blocks = state.positions.shape[0]
-    chains = [gradient, *(chain_from_windows(imu.gradient_bias, blocks) for imu in imus)]
-    band = _band(poses, imus)
+    per = order - 1
+    biases = [_of_blocks(imu, per) for imu in imus]
+    by_biases = [
+        prior.gradient_biases[:, 6 * i : 6 * i + 6] + chain_from_windows(b.gradient) for i, b in enumerate(biases)
+    ]
     return BlockArrow(
-        band=band + jnp.pad(prior.band, [(0, 0), (0, order - prior.band.shape[1]), (0, 0), (0, 0)]),
-        border=_border(corners, imus, layout, blocks),
+        band=_band(gathered_band(poses, per), biases, prior),
+        border=_border(corners, imus, biases, layout, per),
         corner=corner,
-        gradient_chain=jnp.concatenate(chains, axis=1) + prior.gradient,
+        gradient_chain=jnp.concatenate([gathered_chain(gradient, per), *by_biases], axis=1),
         gradient_shared=gradient_shared,
         cost=cost,
     )
 
 
+class _BiasEquations(eqx.Module):
+    """What one IMU says of its biases at both ends of a block of knot intervals: with the poses of the block and the
+    next one (`poses`, n of each), with each other (diagonal), with shared coordinates; and the gradient."""
+
+    poses: Float[Array, "J 2 6 2 n"]
+    biases: Float[Array, "J 2 2 6"]
+    cross: Float[Array, "J 2 6 s"]
+    gradient: Float[Array, "J 2 6"]
+
+
+def _of_blocks(imu: IntervalEquations, per: int) -> _BiasEquations:
+    """From biases at the ends of every knot interval to those at the ends of every `per` of them, linear between."""
+    intervals = imu.gradient.shape[0]
+    count = -(-intervals // per)
+    place = (np.arange(per)[:, None] + np.arange(2)) / per
+    ends = jnp.asarray(np.stack([1.0 - place, place], axis=1))  # (per, ends of the block, ends of the interval)
+
+    def of_blocks(leaf: Array) -> Array:
+        padding = [(0, count * per - intervals)] + [(0, 0)] * (leaf.ndim - 1)
+        return jnp.pad(leaf, padding).reshape(count, per, *leaf.shape[1:])
+
+    with_poses = jnp.einsum("ref,jrfikc->jreikc", ends, of_blocks(imu.bias_pose))
+    poses = jnp.zeros((count, 2, 6, 2 * per, 6))
+    for r in range(per):
+        poses = poses.at[:, :, :, r : r + per + 1].add(with_poses[:, r])
+    return _BiasEquations(
+        poses=poses.reshape(count, 2, 6, 2, 6 * per),
+        biases=jnp.einsum("rea,jrabi,rfb->jefi", ends, of_blocks(imu.bias_bias), ends),
+        cross=jnp.einsum("ref,jrfis->jeis", ends, of_blocks(imu.bias_cross)),
+        gradient=jnp.einsum("ref,jrfi->jei", ends, of_blocks(imu.gradient_bias)),
+    )
+
+
 def _border(
-    corners: PoseEquations, imus: Sequence[IntervalEquations], layout: SharedLayout, blocks: int
-) -> Float[Array, "K B P"]:
+    corners: PoseEquations,
+    imus: Sequence[IntervalEquations],
+    biases: Sequence[_BiasEquations],
+    layout: SharedLayout,
+    per: int,
+) -> Float[Array, "M n P"]:
     """Products of chain and shared coordinates."""
     gravity = layout.gravity_size
     crosses = [chain_from_windows(imu.cross) for imu in imus]
     # Without an IMU (a rolling shutter alone needs a trajectory, too) gravity is held.
-    pulled = sum((cross[..., -gravity:] for cross in crosses), start=jnp.zeros((blocks, 6, gravity)))
+    pulled = sum((cross[..., -gravity:] for cross in crosses), start=jnp.zeros((*corners.gradient.shape, gravity)))
     own = (cross[..., :-gravity] for cross in crosses)
-    rows = [jnp.concatenate([corners.cameras, *own, pulled, corners.others], axis=-1)]
-    for i, imu in enumerate(imus):
+    rows = [gathered_chain(jnp.concatenate([corners.cameras, *own, pulled, corners.others], axis=-1), per)]
+    for i, bias in enumerate(biases):
         place, others = layout.imu(i), layout.size - layout.gravity.stop
-        columns = chain_from_windows(imu.bias_cross, blocks)
+        columns = chain_from_windows(bias.cross)
         before = jnp.pad(columns[..., :-gravity], [(0, 0), (0, 0), (place.start, layout.gravity.start - place.stop)])
         rows.append(jnp.concatenate([before, jnp.pad(columns[..., -gravity:], [(0, 0), (0, 0), (0, others)])], axis=-1))
     return jnp.concatenate(rows, axis=1)
 
 
-def _band(poses: Float[Array, "K w 6 6"], imus: Sequence[IntervalEquations]) -> Float[Array, "K w B B"]:
-    """The band of poses and biases: those of an IMU stand at both ends of an interval, and touch no other IMU's."""
-    blocks, width = poses.shape[:2]
-    diagonals = []
-    for d in range(width):
-        rows = [[poses[:, d], *(_pose_by_bias(imu, d, blocks) for imu in imus)]]
-        for i, imu in enumerate(imus):
-            own = [_bias_by_bias(imu, d, blocks) if i == j else None for j in range(len(imus))]
-            rows.append([_bias_by_pose(imu, d, blocks), *own])
-        zero = jnp.zeros((blocks, 6, 6))
-        rows = [jnp.concatenate([zero if part is None else part for part in row], axis=2) for row in rows]
-        diagonals.append(jnp.concatenate(rows, axis=1))
-    return jnp.stack(diagonals, axis=1)
+def _band(
+    poses: Float[Array, "M 2 n n"], biases: Sequence[_BiasEquations], prior: ChainPrior
+) -> Float[Array, "M 2 B B"]:
+    """Blocks on the diagonal, and below it. The biases of an IMU touch no other IMU's."""
+    blocks = poses.shape[0]
+    after = [(0, 1), (0, 0), (0, 0)]  # nothing follows the last block
+    own, below = [[poses[:, 0]]], [[poses[:, 1]]]
+    for i, bias in enumerate(biases):
+        here, there = bias.poses[:, :, :, 0], bias.poses[:, :, :, 1]
+        by_pose = sum_along_chain([(0, here[:, 0]), (1, there[:, 1])], blocks)
+        information = sum_along_chain([(0, bias.biases[:, 0, 0]), (1, bias.biases[:, 1, 1])], blocks)
+        between = jnp.pad(bias.biases[:, 1, 0], after[:2])
+        information, between = (
+            _diagonal(part + walk[:, 6 * i : 6 * i + 6])
+            for part, walk in zip((information, between), prior.walk.swapaxes(0, 1), strict=True)
+        )
+        none = [jnp.zeros((blocks, 6, 6))] * i
+        for rows, column, row, block in (
+            (own, by_pose.swapaxes(1, 2), by_pose, information),
+            (below, jnp.pad(there[:, 0], after).swapaxes(1, 2), jnp.pad(here[:, 1], after), between),
+        ):
+            for parts, part in zip(rows, [column, *none], strict=True):
+                parts.append(part)
+            rows.append([row, *none, block])
+    return jnp.stack([_joined(own), _joined(below)], axis=1)
 
 
-def _pose_by_bias(imu: IntervalEquations, d: int, blocks: int) -> Float[Array, "K 6 6"] | None:
-    """Rows of poses, columns of the biases that stand `d` chain blocks before them."""
-    order = imu.bias_pose.shape[3]
-    parts = [(e, imu.bias_pose[:, e, :, e + d].swapaxes(1, 2)) for e in range(2) if e + d < order]
-    return sum_along_chain(parts, blocks) if parts else None
+def _joined(rows: Sequence[Sequence[Array]]) -> Float[Array, "M B B"]:
+    return jnp.concatenate([jnp.concatenate(row, axis=2) for row in rows], axis=1)
 
 
-def _bias_by_pose(imu: IntervalEquations, d: int, blocks: int) -> Float[Array, "K 6 6"] | None:
-    """Rows of biases, columns of the poses that stand `d` chain blocks before them."""
-    parts = [(e - d, imu.bias_pose[:, e, :, e - d]) for e in range(d, 2)]
-    return sum_along_chain(parts, blocks) if parts else None
-
-
-def _bias_by_bias(imu: IntervalEquations, d: int, blocks: int) -> Float[Array, "K 6 6"] | None:
-    parts = [(e - d, imu.bias_bias[:, e, e - d, :, None] * jnp.eye(6)) for e in range(d, 2)]
-    return sum_along_chain(parts, blocks) if parts else None
+def _diagonal(values: Float[Array, "M b"]) -> Float[Array, "M b b"]:
+    return values[:, :, None] * jnp.eye(values.shape[1])

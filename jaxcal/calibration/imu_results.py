@@ -22,7 +22,7 @@ from jaxcal.trajectory import PoseSpline
 def imu_calibrations(
     fit: RobustFit, imus: Sequence[ImuRecording], noise: NoiseModel, chain_covariance: np.ndarray, grid: SplineGrid
 ) -> list[ImuCalibration]:
-    """One result per IMU; `chain_covariance` (K, B, B) of the chain blocks."""
+    """One result per IMU; `chain_covariance` (H, B, B) of the chain blocks."""
     ratios = noise.ratios(fit.problem, fit.state)
     return [_one(fit, imus, noise, tuple(ratio.tolist()), chain_covariance, grid, i) for i, ratio in enumerate(ratios)]
 
@@ -56,12 +56,13 @@ def _one(
     binned = noise.binned[number].at_shift(grid, float(fit.problem.imu.samples[number].shift))
     at = (binned.slots[:, 0], binned.slots[:, 1])
     readings, rotation, position = (np.asarray(part)[at] for part in _predicted(fit.problem, state, number))
-    own = slice(6 + 6 * number, 12 + 6 * number)
-    biases = np.asarray(state.biases)[:, own.start - 6 : own.stop - 6]
+    biases = np.asarray(state.biases)[:, 6 * number : 6 * number + 6]
+    own = slice(6 * (grid.order - 1) + 6 * number, 6 * grid.order + 6 * number)
     u = np.asarray(binned.samples.fraction)[at][:, None]
     left = binned.slots[:, 0]
-    knot_std = np.sqrt(np.maximum(np.diagonal(chain_covariance[:, own, own], axis1=1, axis2=2), 0.0))
-    bias, bias_std = ((1.0 - u) * values[left] + u * values[left + 1] for values in (biases, knot_std))
+    std = np.sqrt(np.maximum(np.diagonal(chain_covariance[:, own, own], axis1=1, axis2=2), 0.0))
+    at_knots = (inertial.biases_at_knots(values, grid.intervals, grid.order) for values in (biases, std))
+    bias, bias_std = ((1.0 - u) * values[left] + u * values[left + 1] for values in at_knots)
     sigma = 1.0 / np.asarray(fit.problem.imu.samples[number].inverse_sigma)
     stated, place = imu.noise, fit.problem.layout.imus[number]
     return ImuCalibration(

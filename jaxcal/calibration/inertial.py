@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -14,6 +15,8 @@ from jaxcal.calibration.state import RigState, SharedLayout
 from jaxcal.estimation import on_device
 from jaxcal.imu import imu_model, respond
 from jaxcal.trajectory import Increments, basis_matrix, increments, rotation_at, so3, weights
+
+_Array = TypeVar("_Array", Array, np.ndarray)
 
 # Knot intervals are reduced in batches of this many.
 INTERVAL_BATCH = 32
@@ -96,8 +99,15 @@ def _chain_windows(state: RigState, intervals: int, order: int, imu: int) -> _Wi
         state.rotations[:intervals],
         jax.tree.map(lambda leaf: _windows(leaf, intervals, order - 1), chain),
         _windows(state.positions, intervals, order),
-        _windows(state.biases[:, 6 * imu : 6 * imu + 6], intervals, 2),
+        _windows(biases_at_knots(state.biases[:, 6 * imu : 6 * imu + 6], intervals, order), intervals, 2),
     )
+
+
+def biases_at_knots(biases: Float[_Array, "M b"], intervals: int, order: int) -> Float[_Array, "{intervals}+1 b"]:
+    """Biases at the ends of all knot intervals, from those at every `order` - 1 of them, linear between."""
+    block, place = np.divmod(np.arange(intervals + 1), order - 1)
+    share = (place / (order - 1))[:, None]
+    return (1.0 - share) * biases[block] + share * biases[np.minimum(block + 1, len(biases) - 1)]
 
 
 class _Motion(eqx.Module):
@@ -253,20 +263,22 @@ def predict_samples(
 
 
 class ChainPrior(eqx.Module):
-    """Contributions of the random walk and the motion prior: diagonal and sub-diagonal blocks, and the gradient."""
+    """Contributions of the weak motion prior to the poses (diagonal and sub-diagonal blocks, gradient), and of the
+    random walk to the biases (`walk`: the diagonals of the blocks on the diagonal, and of those below it)."""
 
-    band: Float[Array, "K 3 B B"]
-    gradient: Float[Array, "K B"]
+    band: Float[Array, "K 3 6 6"]
+    gradient: Float[Array, "K 6"]
+    walk: Float[Array, "M 2 b"]
+    gradient_biases: Float[Array, "M b"]
     cost: Float[Array, ""]
 
 
-def linearise_prior(state: RigState, data: InertialData) -> ChainPrior:
+def linearise_prior(state: RigState, data: InertialData, order: int) -> ChainPrior:
     """Bias random walk (Furgale et al. 2013, sec. III-C), switch-on biases, and the weak motion prior."""
     count = state.positions.shape[0]
-    size = 6 + state.biases.shape[1]
-    band = jnp.zeros((count, 3, size, size))
-    gradient = jnp.zeros((count, size))
-    rotation_residual, position_residual, walk_residual, switch_on = _prior_residuals(state, data)
+    band = jnp.zeros((count, 3, 6, 6))
+    gradient = jnp.zeros((count, 6))
+    rotation_residual, position_residual, walk_residual, switch_on = _prior_residuals(state, data, order)
 
     chain = increments(state.rotations)
     scale = 1.0 / (data.rate_sigma * data.dt)
@@ -283,30 +295,38 @@ def linearise_prior(state: RigState, data: InertialData) -> ChainPrior:
         for d in range(3 - a):
             band = band.at[a : count - 2 + a, d, 3:6, 3:6].add(stencil[a] * stencil[a + d] * jnp.eye(3))
 
-    information = jnp.diag(1.0 / data.walk_sigma**2)
-    band = band.at[:-1, 0, 6:, 6:].add(information).at[1:, 0, 6:, 6:].add(information)
-    band = band.at[:-1, 1, 6:, 6:].add(-information)
-    step = walk_residual / data.walk_sigma
-    gradient = gradient.at[1:, 6:].add(step).at[:-1, 6:].add(-step)
+    sigma = _walk_sigma(data, order)
+    information = 1.0 / sigma**2
+    walk = jnp.zeros((len(state.biases), 2, len(sigma)))
+    walk = walk.at[:-1, 0].add(information).at[1:, 0].add(information).at[:-1, 1].add(-information)
+    step = walk_residual / sigma
+    by_biases = jnp.zeros_like(state.biases).at[1:].add(step).at[:-1].add(-step)
     sigma = _switch_on_sigma(state)
-    band = band.at[0, 0, 6:, 6:].add(jnp.diag(1.0 / sigma**2))
-    gradient = gradient.at[0, 6:].add(switch_on / sigma)
+    walk = walk.at[0, 0].add(1.0 / sigma**2)
+    by_biases = by_biases.at[0].add(switch_on / sigma)
 
     parts = (rotation_residual, position_residual, walk_residual, switch_on)
-    return ChainPrior(band, gradient, 0.5 * sum((jnp.sum(part**2) for part in parts), start=jnp.zeros(())))
+    return ChainPrior(
+        band, gradient, walk, by_biases, 0.5 * sum((jnp.sum(part**2) for part in parts), start=jnp.zeros(()))
+    )
 
 
-def prior_residuals(state: RigState, data: InertialData) -> Float[Array, " R"]:
+def prior_residuals(state: RigState, data: InertialData, order: int) -> Float[Array, " R"]:
     """Whitened residuals of the random walk and the weak priors, as one vector."""
-    return jnp.concatenate([jnp.ravel(part) for part in _prior_residuals(state, data)])
+    return jnp.concatenate([jnp.ravel(part) for part in _prior_residuals(state, data, order)])
 
 
-def _prior_residuals(state: RigState, data: InertialData) -> tuple[Array, Array, Array, Array]:
+def _prior_residuals(state: RigState, data: InertialData, order: int) -> tuple[Array, Array, Array, Array]:
     rotation = increments(state.rotations).vector / (data.rate_sigma * data.dt)
     p = state.positions
     position = (p[:-2] - 2.0 * p[1:-1] + p[2:]) / (data.acceleration_sigma * data.dt**2)
-    walk = (state.biases[1:] - state.biases[:-1]) / data.walk_sigma
+    walk = (state.biases[1:] - state.biases[:-1]) / _walk_sigma(data, order)
     return rotation, position, walk, state.biases[0] / _switch_on_sigma(state)
+
+
+def _walk_sigma(data: InertialData, order: int) -> Float[Array, " b"]:
+    """Of the biases from one of their places to the next: as many knot intervals on as a chain block holds."""
+    return np.sqrt(order - 1) * data.walk_sigma
 
 
 def _switch_on_sigma(state: RigState) -> Float[Array, " b"]:

@@ -29,7 +29,8 @@ class LensPrior(eqx.Module):
 class RigProblem(eqx.Module):
     """Corners of all cameras, and IMU samples where there are any, on one trajectory of the rig.
 
-    Without `imu` the chain holds one pose per view (band width zero); with it, spline control points and biases.
+    Without `imu` the chain holds one pose per view (band width zero), or the control points of a spline; with it,
+    blocks of control points and biases (`free_blocks`).
     `free_chain` (B,) and `free` (P,) say which coordinates are estimated; the others are held. `loss_width` is the
     scale of the robust loss in sigmas of a corner; infinity for plain least squares. `basis` are the directions along
     which steps of the lenses are counted. `row_intervals` is how many knot intervals the rows of a rolling-shutter
@@ -83,7 +84,7 @@ class RigProblem(eqx.Module):
             for i in range(len(self.layout.imus)):
                 parts.append(jnp.ravel(inertial.imu_residuals(state, self.imu, self.order, self.layout, i)))
                 parts.append(inertial.model_prior_residuals(state, self.layout, i))
-            parts.append(inertial.prior_residuals(state, self.imu))
+            parts.append(inertial.prior_residuals(state, self.imu, self.order))
         return jnp.concatenate(parts)
 
     # --- parts -------------------------------------------------------------------------------------------------------

@@ -191,10 +191,11 @@ class RigState(eqx.Module):
 
     `lenses[g]` (C_g, n_g) lens parameters of the cameras of group g; `R_cam_rig` (C, 3, 3), `t_cam_rig` (C, 3);
     `shift` (C,) s, rig time = camera time + shift; `gravity` (3,) m/s^2 in the target frame; chain: `rotations`
-    (K, 3, 3) and `positions` (K, 3) of T_target_rig (poses of views, or control points), `biases` (K, 6 M) gyro then
-    accel of each of the M IMUs; `target` what is not known of the target. Of each IMU its model's parameters,
-    `R_imu_rig`, `t_imu_rig`, and `imu_shift` s, rig time = IMU time + shift; the first one's frame and clock are the
-    rig's. `line_delay` (C,) s per row, zero for global shutters; empty where all are global.
+    (K, 3, 3) and `positions` (K, 3) of T_target_rig (poses of views, or control points), `biases` (H, 6 M) gyro then
+    accel of each of the M IMUs, every k - 1 knot intervals from the first, k the spline's order; `target` what is not
+    known of the target. Of each IMU its model's parameters, `R_imu_rig`, `t_imu_rig`, and `imu_shift` s, rig time =
+    IMU time + shift; the first one's frame and clock are the rig's. `line_delay` (C,) s per row, zero for global
+    shutters; empty where all are global.
     """
 
     lenses: tuple[Float[Array, "_ _"], ...]
@@ -204,7 +205,7 @@ class RigState(eqx.Module):
     gravity: Float[Array, "3"]
     rotations: Float[Array, "K 3 3"]
     positions: Float[Array, "K 3"]
-    biases: Float[Array, "K b"]
+    biases: Float[Array, "H b"]
     target: TargetState
     imu_parameters: tuple[Float[Array, "_"], ...] = ()
     R_imu_rig: Float[Array, "M 3 3"] = eqx.field(default_factory=lambda: on_device(np.zeros((0, 3, 3))))
@@ -213,7 +214,13 @@ class RigState(eqx.Module):
     line_delay: Float[Array, " D"] = eqx.field(default_factory=lambda: on_device(np.zeros(0)))
 
     def retract(self, layout: SharedLayout, chain: Float[Array, "K B"], shared: Float[Array, " P"]) -> "RigState":
-        """Move along a tangent step: rotations of the chain on the right, those of the cameras on the left."""
+        """Move along a tangent step: rotations of the chain on the right, those of the cameras on the left.
+
+        `chain` row by row: six coordinates of each of some poses, as many as fill the row, then those of the biases;
+        rows may hold more poses than there are.
+        """
+        chain, by_biases = jnp.split(chain, [chain.shape[1] - self.biases.shape[1]], axis=1)
+        chain = chain.reshape(-1, 6)[: len(self.positions)]
         lenses = tuple(
             values + jnp.stack([shared[layout.lens(c)] for c in members])
             for values, members in zip(self.lenses, layout.groups, strict=True)
@@ -240,7 +247,7 @@ class RigState(eqx.Module):
             gravity=gravity,
             rotations=self.rotations @ of_chain,
             positions=self.positions + chain[:, 3:6],
-            biases=self.biases + chain[:, 6:],
+            biases=self.biases + by_biases,
             target=self.target.retract(layout, shared[layout.target]) if layout.target_size else self.target,
             imu_parameters=tuple(
                 values + step[: imu.parameters]
@@ -257,6 +264,16 @@ class RigState(eqx.Module):
         cameras = range(layout.num_cameras)
         zero = jnp.zeros(())
         return jnp.stack([shared[layout.line_delay(c)] if layout.is_rolling(c) else zero for c in cameras])
+
+
+def free_blocks(poses: int, order: int, imus: int) -> np.ndarray:
+    """Which coordinates (H, 6 (k - 1) + 6 M) of a chain of control points and the biases of M IMUs there are: all but
+    the control points that the last block has no more of."""
+    per = order - 1
+    count = -(-poses // per)
+    free = np.ones((count, 6 * per + 6 * imus), dtype=bool)
+    free[:, : 6 * per] = np.arange(count * per * 6).reshape(count, -1) < 6 * poses
+    return free
 
 
 def tangent_basis(vector: Float[_Array, "3"]) -> Float[_Array, "3 2"]:

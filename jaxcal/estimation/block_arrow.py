@@ -203,6 +203,18 @@ def factorise(
     )
 
 
+def gathered_band(band: Float[Array, "K w B B"], per: int) -> Float[Array, "M 2 n n"]:
+    """The same band in blocks of `per` chain blocks each, w - 1 at least, which couple to their followers alone. Chain
+    blocks that are missing in the last one are rows of the identity."""
+    count = -(-band.shape[0] // per)
+    return jnp.stack(_superblock_matrices(band, jnp.zeros(band.shape[:1] + band.shape[2:3]), per, count), axis=1)
+
+
+def gathered_chain(rows: Float[Array, "K B *rest"], per: int) -> Float[Array, "M n *rest"]:
+    """As `gathered_band` for gradients and border rows; what is missing is zero."""
+    return _to_superblocks(rows, per)
+
+
 def _to_superblocks(rows: Float[Array, "K B *rest"], per: int) -> Float[Array, "J n *rest"]:
     num_blocks, size, *rest = rows.shape
     num_super = -(-num_blocks // per)
