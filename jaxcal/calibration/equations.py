@@ -106,25 +106,23 @@ class _BiasEquations(eqx.Module):
 
 
 def _of_blocks(imu: IntervalEquations, per: int) -> _BiasEquations:
-    """From biases at the ends of every knot interval to those at the ends of every `per` of them, linear between."""
+    """Summed over the `per` knot intervals of each block."""
     intervals = imu.gradient.shape[0]
     count = -(-intervals // per)
-    place = (np.arange(per)[:, None] + np.arange(2)) / per
-    ends = jnp.asarray(np.stack([1.0 - place, place], axis=1))  # (per, ends of the block, ends of the interval)
 
     def of_blocks(leaf: Array) -> Array:
         padding = [(0, count * per - intervals)] + [(0, 0)] * (leaf.ndim - 1)
         return jnp.pad(leaf, padding).reshape(count, per, *leaf.shape[1:])
 
-    with_poses = jnp.einsum("ref,jrfikc->jreikc", ends, of_blocks(imu.bias_pose))
+    with_poses = of_blocks(imu.bias_pose)
     poses = jnp.zeros((count, 2, 6, 2 * per, 6))
-    for r in range(per):
-        poses = poses.at[:, :, :, r : r + per + 1].add(with_poses[:, r])
+    for place in range(per):
+        poses = poses.at[:, :, :, place : place + per + 1].add(with_poses[:, place])
     return _BiasEquations(
         poses=poses.reshape(count, 2, 6, 2, 6 * per),
-        biases=jnp.einsum("rea,jrabi,rfb->jefi", ends, of_blocks(imu.bias_bias), ends),
-        cross=jnp.einsum("ref,jrfis->jeis", ends, of_blocks(imu.bias_cross)),
-        gradient=jnp.einsum("ref,jrfi->jei", ends, of_blocks(imu.gradient_bias)),
+        biases=of_blocks(imu.bias_bias).sum(axis=1),
+        cross=of_blocks(imu.bias_cross).sum(axis=1),
+        gradient=of_blocks(imu.gradient_bias).sum(axis=1),
     )
 
 

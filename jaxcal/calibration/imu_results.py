@@ -58,11 +58,10 @@ def _one(
     readings, rotation, position = (np.asarray(part)[at] for part in _predicted(fit.problem, state, number))
     biases = np.asarray(state.biases)[:, 6 * number : 6 * number + 6]
     own = slice(6 * (grid.order - 1) + 6 * number, 6 * grid.order + 6 * number)
-    u = np.asarray(binned.samples.fraction)[at][:, None]
-    left = binned.slots[:, 0]
     std = np.sqrt(np.maximum(np.diagonal(chain_covariance[:, own, own], axis1=1, axis2=2), 0.0))
-    at_knots = (inertial.biases_at_knots(values, grid.intervals, grid.order) for values in (biases, std))
-    bias, bias_std = ((1.0 - u) * values[left] + u * values[left + 1] for values in at_knots)
+    block, place = np.divmod(binned.slots[:, 0], grid.order - 1)
+    share = ((place + np.asarray(binned.samples.fraction)[at]) / (grid.order - 1))[:, None]
+    bias, bias_std = ((1.0 - share) * values[block] + share * values[block + 1] for values in (biases, std))
     sigma = 1.0 / np.asarray(fit.problem.imu.samples[number].inverse_sigma)
     stated, place = imu.noise, fit.problem.layout.imus[number]
     return ImuCalibration(

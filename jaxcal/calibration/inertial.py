@@ -1,8 +1,6 @@
 """IMU samples, the biases' random walk, and the weak motion prior that keeps unobserved knots defined."""
 
-import functools
 from collections.abc import Callable
-from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -15,8 +13,6 @@ from jaxcal.calibration.state import RigState, SharedLayout
 from jaxcal.estimation import on_device
 from jaxcal.imu import imu_model, respond
 from jaxcal.trajectory import Increments, basis_matrix, increments, rotation_at, so3, weights
-
-_Array = TypeVar("_Array", Array, np.ndarray)
 
 # Knot intervals are reduced in batches of this many.
 INTERVAL_BATCH = 32
@@ -60,8 +56,9 @@ class InertialData(eqx.Module):
 
 
 class IntervalEquations(eqx.Module):
-    """What one IMU says in each knot interval: of a window of k poses (6 coordinates each), of its biases at the
-    interval's two ends, and of s shared coordinates: the IMU's own (parameters, place, time shift), and gravity.
+    """What one IMU says in each knot interval: of a window of k poses (6 coordinates each), of its biases at the two
+    ends of the interval's block of k - 1, and of s shared coordinates: the IMU's own (parameters, place, time shift),
+    and gravity.
 
     `bias_pose` and `bias_cross` are the biases' products with poses and shared coordinates; those of the biases with
     each other are diagonal.
@@ -85,29 +82,34 @@ def _windows(chain: Array, intervals: int, length: int) -> Array:
 
 
 class _Window(eqx.Module):
-    """The chain around one knot interval."""
+    """The chain around one knot interval; the biases at both ends of its block of `per` intervals, of which it is
+    number `place`."""
 
     first: Float[Array, "*I 3 3"]
     increments: Increments
     control: Float[Array, "*I k 3"]
     bias: Float[Array, "*I 2 6"]
+    place: Float[Array, "*I"]
+    per: int = eqx.field(static=True)
+
+    def bias_weights(self, u: Array) -> Float[Array, "2 *S"]:
+        """How much each of the two biases counts at places u in the interval."""
+        share = (self.place + u) / self.per
+        return jnp.stack([1.0 - share, share])
 
 
 def _chain_windows(state: RigState, intervals: int, order: int, imu: int) -> _Window:
     chain = increments(state.rotations)
+    biases = state.biases[:, 6 * imu : 6 * imu + 6]
+    block, place = np.divmod(np.arange(intervals), order - 1)
     return _Window(
         state.rotations[:intervals],
         jax.tree.map(lambda leaf: _windows(leaf, intervals, order - 1), chain),
         _windows(state.positions, intervals, order),
-        _windows(biases_at_knots(state.biases[:, 6 * imu : 6 * imu + 6], intervals, order), intervals, 2),
+        jnp.stack([biases[block], biases[block + 1]], axis=1),
+        jnp.asarray(place, dtype=float),
+        order - 1,
     )
-
-
-def biases_at_knots(biases: Float[_Array, "M b"], intervals: int, order: int) -> Float[_Array, "{intervals}+1 b"]:
-    """Biases at the ends of all knot intervals, from those at every `order` - 1 of them, linear between."""
-    block, place = np.divmod(np.arange(intervals + 1), order - 1)
-    share = (place / (order - 1))[:, None]
-    return (1.0 - share) * biases[block] + share * biases[np.minimum(block + 1, len(biases) - 1)]
 
 
 class _Motion(eqx.Module):
@@ -153,14 +155,14 @@ def _sample_rows(
     state: RigState, layout: SharedLayout, imu: int, data: ImuSamples, dt: Array, order: int
 ) -> Callable[[Array, Array, _Window], tuple[Array, Array]]:
     """A function from one sample (fraction, reading, window) to its Jacobian rows (6, 6 k + s + 1), residual last, and
-    the weights (2,) of the biases at the interval's ends in all six."""
+    the weights (2,) of the window's biases in all six."""
     own = layout.imus[imu]
     basis = layout.gravity_basis(state.gravity)
 
     def of_sample(u: Array, reading: Array, window: _Window) -> tuple[Array, Array]:
         u = u + (state.imu_shift[imu] - data.shift) / dt
         motion = _motion(window, u, dt, state.gravity, order)
-        ends = jnp.stack([1.0 - u, u])
+        ends = window.bias_weights(u)
 
         def response(value: Array, step: Array) -> Array:
             return _responses(state, layout, imu, value, step)
@@ -176,7 +178,7 @@ def _sample_rows(
                 return _motion(window, u, dt, state.gravity, order).value
 
             _, rate = jax.jvp(value_at, (u,), (1.0 / dt,))
-            columns.append((by_value @ rate + (window.bias[1] - window.bias[0]) / dt)[:, None])
+            columns.append((by_value @ rate + (window.bias[1] - window.bias[0]) / (window.per * dt))[:, None])
         predicted = response(motion.value, zero) + ends @ window.bias
         return jnp.concatenate([*columns, by_gravity, (predicted - reading)[:, None]], axis=1), ends
 
@@ -205,27 +207,39 @@ def _reduce_calibrated(
 ) -> tuple[Array, Array, Array]:
     """As `_reduce_any`, of an IMU that has no shared coordinates of its own."""
     *samples, window = parts
-    chain = (window.first, window.increments, window.control, window.bias)
+    chain = (window.first, window.increments, window.control)
+    biases = (window.bias, window.bias_weights(samples[0].T))
     basis = layout.gravity_basis(state.gravity)
-    return reduce_batch(tuple(samples), *chain, data.inverse_sigma, state.gravity, basis, dt)
+    return reduce_batch(tuple(samples), *chain, *biases, data.inverse_sigma, state.gravity, basis, dt)
 
 
 def linearise_imu(state: RigState, data: InertialData, order: int, layout: SharedLayout, imu: int) -> IntervalEquations:
     """Equations of all samples of one IMU."""
     samples = data.samples[imu]
     intervals = samples.fraction.shape[0]
-    n = 6 * order
     parts = (samples.fraction, samples.readings, samples.present, _chain_windows(state, intervals, order, imu))
     batches = jax.tree.map(lambda leaf: leaf.reshape(-1, INTERVAL_BATCH, *leaf.shape[1:]), parts)
     reduce = _reduce_any if layout.imus[imu].size else _reduce_calibrated
-    reduced = jax.lax.map(functools.partial(reduce, state, layout, imu, samples, data.dt, order), batches)
-    gram, with_bias, bias_bias = (leaf.reshape(intervals, *leaf.shape[2:]) for leaf in reduced)
+
+    # Taken apart where a batch is still at hand: all of these matrices would have to be moved once more.
+    def of_batch(parts: tuple) -> IntervalEquations:
+        return _taken_apart(*reduce(state, layout, imu, samples, data.dt, order, parts), order)
+
+    by_batch = jax.lax.map(of_batch, batches)
+    joined = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), by_batch)
+    whole = tuple(leaf.sum(axis=0) for leaf in (by_batch.shared, by_batch.gradient_shared, by_batch.cost))
+    return eqx.tree_at(lambda e: (e.shared, e.gradient_shared, e.cost), joined, whole)
+
+
+def _taken_apart(gram: Array, with_bias: Array, bias_bias: Array, order: int) -> IntervalEquations:
+    """The sums of some intervals (B, ...) by what they are about."""
+    n, batch = 6 * order, len(gram)
     shared = gram[:, n:, n:].sum(axis=0)
     return IntervalEquations(
-        window=gram[:, :n, :n].reshape(intervals, order, 6, order, 6),
-        cross=gram[:, :n, n:-1].reshape(intervals, order, 6, -1),
-        gradient=gram[:, :n, -1].reshape(intervals, order, 6),
-        bias_pose=with_bias[..., :n].reshape(intervals, 2, 6, order, 6),
+        window=gram[:, :n, :n].reshape(batch, order, 6, order, 6),
+        cross=gram[:, :n, n:-1].reshape(batch, order, 6, -1),
+        gradient=gram[:, :n, -1].reshape(batch, order, 6),
+        bias_pose=with_bias[..., :n].reshape(batch, 2, 6, order, 6),
         bias_cross=with_bias[..., n:-1],
         bias_bias=bias_bias,
         gradient_bias=with_bias[..., -1],
@@ -255,7 +269,7 @@ def predict_samples(
     def sample(u: Array, window: _Window) -> Array:
         u = u + (state.imu_shift[imu] - samples.shift) / data.dt
         motion = _motion(window, u, data.dt, state.gravity, order)
-        bias = (1.0 - u) * window.bias[0] + u * window.bias[1]
+        bias = window.bias_weights(u) @ window.bias
         return _responses(state, layout, imu, motion.value, zero) + bias
 
     windows = _chain_windows(state, intervals, order, imu)

@@ -32,8 +32,8 @@ def hat(vector: Float[Array, "3 *T"]) -> Float[Array, "3 3 *T"]:
     return jnp.tensordot(jnp.asarray(_LEVI_CIVITA), vector, axes=1)
 
 
-def product(left: Float[Array, "m 3 *T"], right: Float[Array, "3 *nT"]) -> Float[Array, "m *nT"]:
-    """left @ right, of two matrices or of a matrix and a vector, written out."""
+def product(left: Float[Array, "m 3 *T"], right: Float[Array, "3 *nT"]) -> Float[Array, "m ..."]:
+    """left @ right, of two matrices or of a matrix and a vector, written out; either may be of length 1 along T."""
     columns = left[:, :, None] if right.ndim == left.ndim else left
     return columns[:, 0] * right[0] + columns[:, 1] * right[1] + columns[:, 2] * right[2]
 

@@ -48,7 +48,16 @@ def both_ways(order: int, rotations, positions, biases, u, readings, present, in
     chain = jax.vmap(increments)(rotations)
     samples = (u, readings, present)
     ours = reduce_batch(
-        samples, rotations[:, 0], chain, positions, biases, inverse_sigma, GRAVITY, BASIS, jnp.asarray(DT)
+        samples,
+        rotations[:, 0],
+        chain,
+        positions,
+        biases,
+        jnp.stack([1.0 - u.T, u.T]),
+        inverse_sigma,
+        GRAVITY,
+        BASIS,
+        jnp.asarray(DT),
     )
 
     def of_sample(rotations, positions, bias, u, reading, present) -> tuple:

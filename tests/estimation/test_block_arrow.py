@@ -8,7 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxcal.estimation import BlockArrow, band_from_windows, chain_from_windows, factorise
+from jaxcal.estimation import (
+    BlockArrow,
+    band_from_windows,
+    chain_from_windows,
+    factorise,
+    gathered_band,
+    gathered_chain,
+)
 
 
 def random_equations(num_blocks: int, width: int, size: int, shared: int, seed: int) -> tuple[BlockArrow, np.ndarray]:
@@ -68,6 +75,28 @@ def test_assembly_solve_and_covariance_equal_dense_algebra(shape: tuple[int, int
     for k in range(num_blocks):
         rows = slice(k * size, (k + 1) * size)
         np.testing.assert_allclose(blocks[k], inverse[rows, rows], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(("width", "per", "blocks"), [(2, 1, 5), (3, 2, 6), (3, 2, 7), (4, 5, 8)])
+def test_gathered_blocks_are_the_same_equations_and_the_identity_where_the_last_is_not_full(
+    width: int, per: int, blocks: int
+) -> None:
+    equations, dense = random_equations(blocks, width, 2, 3, seed=0)
+    gathered = BlockArrow(
+        band=gathered_band(equations.band, per),
+        border=gathered_chain(equations.border, per),
+        corner=equations.corner,
+        gradient_chain=gathered_chain(equations.gradient_chain, per),
+        gradient_shared=equations.gradient_shared,
+        cost=equations.cost,
+    )
+    added = 2 * (-blocks % per)
+    order = np.r_[np.arange(2 * blocks), np.arange(2 * blocks + added, len(dense) + added)]
+    expected = np.eye(len(dense) + added)
+    expected[np.ix_(order, order)] = dense
+    np.testing.assert_allclose(gathered.dense(), expected, atol=1e-9)
+    np.testing.assert_array_equal(np.ravel(gathered.gradient_chain)[: 2 * blocks], np.ravel(equations.gradient_chain))
+    assert not np.ravel(gathered.gradient_chain)[2 * blocks :].any()
 
 
 @pytest.mark.parametrize("width", [1, 3])
