@@ -32,12 +32,12 @@ def pole_sentences(fit: RobustFit, cameras: Sequence[CameraFrames]) -> list[str]
     still = _errors(fit, cameras, np.zeros(3))
     turned = [_errors(fit, cameras, _TURN * axis) for axis in np.eye(3)]
     sentences = []
-    for c in np.flatnonzero(may_cancel):
+    for c, frames in enumerate(cameras):
         moves = [np.linalg.norm(errors[c] - still[c], axis=-1) for errors in turned]
         farthest = np.where(fit.kept[c], np.max(moves, axis=0), 0.0)
-        if fit.kept[c].any() and farthest.max() > _JUMP * np.median(farthest[fit.kept[c]]):
+        if may_cancel[c] and fit.kept[c].any() and farthest.max() > _JUMP * np.median(farthest[fit.kept[c]]):
             row, point = np.unravel_index(np.argmax(farthest), farthest.shape)
-            sentences.append(_SENTENCE.format(camera=c, frame=int(cameras[c].frames[row]), point=int(point)))
+            sentences.append(_SENTENCE.format(camera=c, frame=int(frames.frames[row]), point=int(point)))
     return sentences
 
 
