@@ -15,19 +15,23 @@ from jaxcal.calibration.state import RigState, tangent_basis
 from jaxcal.estimation import BlockArrow
 
 seeds = st.integers(0, 2**31 - 1)
+# Each program runs a few times on a second's data: it is compiled in half the time where it need not be quick.
+hardly_optimised = eqx.filter_jit(
+    compiler_options={"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+)
 
 
-@eqx.filter_jit
+@hardly_optimised
 def linearise(problem: RigProblem, state: RigState) -> BlockArrow:
     return problem.linearise(state)
 
 
-@eqx.filter_jit
+@hardly_optimised
 def move(problem: RigProblem, state: RigState, chain: Array, shared: Array) -> RigState:
     return problem.retract(state, chain, shared)
 
 
-@eqx.filter_jit
+@hardly_optimised
 def pushed(problem: RigProblem, state: RigState, vector: Array) -> tuple[Array, Array]:
     """Residuals r (R,) and J v (R,) by automatic differentiation; tangent vectors with the chain first."""
 
@@ -39,7 +43,7 @@ def pushed(problem: RigProblem, state: RigState, vector: Array) -> tuple[Array, 
     return jax.jvp(at, (jnp.zeros_like(vector),), (vector,))
 
 
-@eqx.filter_jit
+@hardly_optimised
 def structured(equations: BlockArrow, vector: Array) -> tuple[Array, Array, Array]:
     """Gradient, diagonal of H, and H v."""
     split = equations.gradient_chain.size
