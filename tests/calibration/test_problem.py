@@ -1,5 +1,7 @@
 """The structured normal equations are those of the residuals, as automatic differentiation gives them."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,9 +18,10 @@ from jaxcal.estimation import BlockArrow
 
 seeds = st.integers(0, 2**31 - 1)
 # Each program runs a few times on a second's data: it is compiled in half the time where it need not be quick.
-hardly_optimised = eqx.filter_jit(
-    compiler_options={"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-)
+_OPTIONS: dict[str, Any] = {
+    "compiler_options": {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+}
+hardly_optimised = eqx.filter_jit(**_OPTIONS)
 
 
 @hardly_optimised
