@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -92,9 +93,12 @@ def finish(rig: Path) -> dict[str, Any]:
 
 
 def parts(rig: Path) -> dict[str, int]:
-    """Finished parts of the detection, and when each was written."""
-    found = (rig.parent / ".jaxcal").glob("*.parts/[0-9]*.npz")
-    return {path.name: path.stat().st_mtime_ns for path in found}
+    """Finished parts of the detection, and when each was written; a run at work may take them away meanwhile."""
+    written: dict[str, int] = {}
+    with suppress(FileNotFoundError):
+        for path in (rig.parent / ".jaxcal").glob("*.parts/[0-9]*.npz"):
+            written[path.name] = path.stat().st_mtime_ns
+    return written
 
 
 def corners(rig: Path) -> list[Path]:
@@ -103,11 +107,13 @@ def corners(rig: Path) -> list[Path]:
 
 def kill_when(process: "subprocess.Popen[str]", reached: Any, delay_s: float) -> None:
     end = time.monotonic() + 300
-    while process.poll() is None and not reached() and time.monotonic() < end:
-        time.sleep(0.002)
-    time.sleep(delay_s)
-    process.kill()
-    process.communicate()
+    try:
+        while process.poll() is None and not reached() and time.monotonic() < end:
+            time.sleep(0.002)
+        time.sleep(delay_s)
+    finally:  # a process that outlives its test fails another one
+        process.kill()
+        process.communicate()
 
 
 def nothing_is_half_written(rig: Path) -> None:
