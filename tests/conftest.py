@@ -7,8 +7,27 @@ from pathlib import Path
 
 import jax
 import pytest
+from jaxlib import xla_client
 
 from jaxcal.programs import forget_programs
+
+_FEW_PASSES = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+
+
+def _compile_with_few_passes() -> None:
+    """Most of the suite's time is XLA's compiler at work on programs that run once or twice; with fewer passes it takes
+    half of it. What a test starts as a process of its own (the main job, the command line) compiles as a user's does.
+    """
+    before = os.environ.get("XLA_FLAGS")
+    os.environ["XLA_FLAGS"] = f"{_FEW_PASSES} {before or ''}"
+    xla_client.CompileOptions()  # XLA reads the variable when it is first asked, and never again
+    if before is None:
+        del os.environ["XLA_FLAGS"]
+    else:
+        os.environ["XLA_FLAGS"] = before
+
+
+_compile_with_few_passes()
 
 
 def _data_folder() -> Path | None:

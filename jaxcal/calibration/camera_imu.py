@@ -21,7 +21,7 @@ from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.robust import robust_fit
 from jaxcal.calibration.rolling import row_intervals, shutters_of
 from jaxcal.calibration.spline_setup import BinnedImu, SplineGrid
-from jaxcal.calibration.state import RigState, SharedLayout, flat_target, free_blocks, layout_of
+from jaxcal.calibration.state import RigState, SharedLayout, block_count, flat_target, free_blocks, layout_of
 from jaxcal.calibration.target_shape import TargetGeometry, geometry_of
 from jaxcal.calibration.uncertainty import stamp_sigmas_of, with_common_delay
 from jaxcal.cameras import CameraModel, model_name
@@ -339,7 +339,7 @@ def _first_state(
         gravity=on_device(initial_imu.gravity_from(orientation, imu.accel_m_s2[inside])),
         rotations=on_device(rotations),
         positions=on_device(positions),
-        biases=on_device(np.tile(biases, (-(-len(positions) // (grid.order - 1)), 1))),
+        biases=on_device(np.tile(biases, (block_count(len(positions), grid.order), 1))),
         target=flat_target(layout),
         imu_parameters=tuple(on_device(np.asarray(imu_model(imu.model).nominal, dtype=float)) for imu in layout.imus),
         R_imu_rig=on_device(np.stack([place.R_imu_imu0 for place in others])),

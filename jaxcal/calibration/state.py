@@ -266,11 +266,16 @@ class RigState(eqx.Module):
         return jnp.stack([shared[layout.line_delay(c)] if layout.is_rolling(c) else zero for c in cameras])
 
 
+def block_count(poses: int, order: int) -> int:
+    """Blocks of a chain of control points, each with those of k - 1 knot intervals (and one set of biases)."""
+    return -(-poses // (order - 1))
+
+
 def free_blocks(poses: int, order: int, imus: int) -> np.ndarray:
     """Which coordinates (H, 6 (k - 1) + 6 M) of a chain of control points and the biases of M IMUs there are: all but
     the control points that the last block has no more of."""
     per = order - 1
-    count = -(-poses // per)
+    count = block_count(poses, order)
     free = np.ones((count, 6 * per + 6 * imus), dtype=bool)
     free[:, : 6 * per] = np.arange(count * per * 6).reshape(count, -1) < 6 * poses
     return free

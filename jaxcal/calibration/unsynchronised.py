@@ -14,7 +14,7 @@ from jaxcal.calibration.poses import Poses, inverse
 from jaxcal.calibration.problem import RigProblem
 from jaxcal.calibration.rolling import row_intervals
 from jaxcal.calibration.spline_setup import SplineGrid
-from jaxcal.calibration.state import RigState, SharedLayout, flat_target, free_blocks
+from jaxcal.calibration.state import RigState, SharedLayout, block_count, flat_target, free_blocks
 from jaxcal.calibration.target_shape import geometry_of
 from jaxcal.cameras import CameraModel
 from jaxcal.errors import CalibrationError
@@ -111,7 +111,7 @@ def continuous_problem(
         gravity=on_device([0.0, 0.0, -1.0]),
         rotations=on_device(rotations),
         positions=on_device(positions),
-        biases=on_device(np.zeros((-(-knots // (_ORDER - 1)), 0))),
+        biases=on_device(np.zeros((block_count(knots, _ORDER), 0))),
         target=flat_target(layout),
         line_delay=on_device(np.zeros(len(lenses) if layout.rolling else 0)),
     )

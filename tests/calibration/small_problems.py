@@ -16,7 +16,7 @@ from jaxcal.calibration.inertial import InertialData
 from jaxcal.calibration.lens_basis import own_parameters
 from jaxcal.calibration.problem import LensPrior, RigProblem
 from jaxcal.calibration.spline_setup import bin_imu, make_grid
-from jaxcal.calibration.state import RigState, TargetState, flat_target, free_blocks, layout_of
+from jaxcal.calibration.state import RigState, TargetState, block_count, flat_target, free_blocks, layout_of
 from jaxcal.calibration.target_shape import geometry_of
 from jaxcal.cameras import CameraModel, PinholeEquidistant, PinholeRadtan
 from jaxcal.imu import imu_model
@@ -159,7 +159,7 @@ def with_imu(
         gravity=jnp.asarray([0.3, -9.7, 1.1]),
         rotations=jnp.asarray(np.diag([1.0, -1.0, -1.0]) @ turns),
         positions=jnp.asarray(np.array([0.15, 0.1, 1.0]) + 0.05 * rng.standard_normal((count, 3))),
-        biases=jnp.asarray(0.1 * rng.standard_normal((-(-count // (order - 1)), 6 * len(models)))),
+        biases=jnp.asarray(0.1 * rng.standard_normal((block_count(count, order), 6 * len(models)))),
         target=flat_target(layout),
         imu_parameters=tuple(
             jnp.asarray(np.array(imu_model(name).nominal) + 0.1 * rng.standard_normal(imu_model(name).size))
