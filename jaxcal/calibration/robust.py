@@ -28,8 +28,10 @@ _PLAIN = 3
 # All rounds but the last only find the noise and the outliers: they end when a step promises less than this share of
 # the cost, which is a hundredth of a sigma in each of a thousand parameters.
 _ENOUGH_FOR_NOISE = 1e-5
-# The first step of a round that starts at the optimum of the one before is hardly damped.
-_NEXT_DAMPING = 1e-7
+# The first step of a round that starts at the optimum of the one before is hardly damped; nor is any of a trajectory's:
+# damping counts in units of the Hessian's diagonal, which for dense control points is that of one shaking against its
+# neighbours, and holds back what they do together, which counts a millionth of that.
+_NEXT_DAMPING, _TRAJECTORY_DAMPING = 1e-7, 1e-10
 
 # Adapts a problem to the residuals found so far (re-weights its IMU, say) before a round.
 Reweigh = Callable[[RigProblem, RigState], RigProblem]
@@ -91,7 +93,7 @@ def robust_fit(
             state,
             max_steps=max_steps,
             rtol=0.0 if stage == ROUNDS - 1 else _ENOUGH_FOR_NOISE,
-            damping=FIRST_DAMPING if stage == 0 else _NEXT_DAMPING,
+            damping=_first_damping(problem, stage),
         )
         # With the noise known and the lens near its optimum: before views and corners are judged by their errors.
         state = turn_mirrored(problem, result.state, max_steps) if stage == 1 else result.state
@@ -114,6 +116,12 @@ def robust_fit(
     usual = _in_usual_units(errors, cameras, all_alike([len(s) for s in seen]))
     sigmas = [outliers.rms_sigma(e, k, p) for e, k, p in zip(usual, known.kept, parameters, strict=True)]
     return RobustFit(problem, result, errors, known.kept, sigmas, known.redundancy)
+
+
+def _first_damping(problem: RigProblem, stage: int) -> float:
+    if problem.imu is not None:
+        return _TRAJECTORY_DAMPING
+    return FIRST_DAMPING if stage == 0 else _NEXT_DAMPING
 
 
 @dataclass(frozen=True)
