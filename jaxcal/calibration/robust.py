@@ -30,7 +30,7 @@ _PLAIN = 3
 _ENOUGH_FOR_NOISE = 1e-5
 # The first step of a round that starts at the optimum of the one before is hardly damped; nor is any of a trajectory's:
 # damping counts in units of the Hessian's diagonal, which for dense control points is that of one shaking against its
-# neighbours, and holds back what they do together, which counts a millionth of that.
+# neighbours, and holds back what they do together, which counts for far less.
 _NEXT_DAMPING, _TRAJECTORY_DAMPING = 1e-7, 1e-10
 
 # Adapts a problem to the residuals found so far (re-weights its IMU, say) before a round.
