@@ -7,8 +7,24 @@ from pathlib import Path
 
 import jax
 import pytest
+from jaxlib import xla_client
 
 from jaxcal.programs import forget_programs
+
+_VARIABLE = "XLA_FLAGS"
+_FEW_PASSES = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
+
+# Most of the suite's time is XLA's compiler at work on programs that run once or twice; with fewer passes it takes half
+# of it. Set here, and so inherited by pytest-xdist's processes, in which XLA has read it before they come to this file
+# (as it has here: a run in one process compiles as usual).
+if not os.environ.get(_VARIABLE, "").startswith(_FEW_PASSES):
+    os.environ[_VARIABLE] = _FEW_PASSES + os.environ.get(_VARIABLE, "")
+
+
+def _compile_as_usual_in_other_processes() -> None:
+    """What a test starts as a process of its own (the main job, the command line) compiles as a user's does."""
+    xla_client.CompileOptions()  # XLA reads the variable when it is first asked, and never again
+    os.environ[_VARIABLE] = os.environ[_VARIABLE].removeprefix(_FEW_PASSES)
 
 
 def _data_folder() -> Path | None:
@@ -17,6 +33,8 @@ def _data_folder() -> Path | None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if not config.getoption("numprocesses", None):  # this process runs tests
+        _compile_as_usual_in_other_processes()
     folder = _data_folder()
     if folder is not None and not folder.is_dir():
         raise pytest.UsageError(f"JAXCAL_DATA is {folder}, which is not a folder.")
