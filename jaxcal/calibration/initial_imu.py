@@ -14,12 +14,17 @@ STANDARD_GRAVITY = 9.80665
 # Frames further apart than this do not give a rate of turn.
 _LONGEST_STEP_S = 0.2
 _COARSE_STEP_S = 0.01
-_FINE_STEP_S = 0.001
+# Offsets are refined within a coarse step, in two rounds of ever smaller steps.
+_FINE_STEPS_S = (0.005, 0.001)
 # The gyroscope's integral is sampled so many times per coarse step.
 _GRID_PER_STEP = 4
 _LARGEST_SHIFT_S = 5.0
+# Offsets tried at once: few enough for their table to stay in the cache.
+_SHIFTS_AT_ONCE = 64
 _TRIM = 0.8
 _LEAST_CORRELATION = 0.4
+# Relative rounding of rates of turn, in single precision, and more.
+_ROUNDING = 1e-6
 _LEAST_TURNING = 0.05
 # Offsets of the halves of a recording further apart than this are two offsets, where each half has so many frames and
 # its turning leaves so little unexplained, by itself and beside what one offset leaves (s; frames; shares).
@@ -64,11 +69,11 @@ class TurnIntegral:
         self._integral = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * step * (gyro[1:] + gyro[:-1]), axis=0)])
 
     def _at(self, time_s: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(time_s, self._time, self._integral[:, a]) for a in range(3)], axis=1)
+        return np.stack([np.interp(time_s, self._time, self._integral[:, a]) for a in range(3)], axis=-1)
 
     def mean_rate(self, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
-        """Mean angular velocity (n, 3) over spans; NaN where a span leaves the recording."""
-        rate = (self._at(stop) - self._at(start)) / (stop - start)[:, None]
+        """Mean angular velocity (..., 3) over spans; NaN where a span leaves the recording."""
+        rate = (self._at(stop) - self._at(start)) / (stop - start)[..., None]
         outside = (start < self._time[0]) | (stop > self._time[-1])
         rate[outside] = np.nan
         return rate
@@ -89,6 +94,18 @@ class TurnIntegral:
         return float(self._time[0])
 
 
+@dataclass(frozen=True)
+class _Turning:
+    """A camera's mean rate of turn `rate` (n, 3), camera frame, from `start` to `stop` (n,), s."""
+
+    start: np.ndarray
+    stop: np.ndarray
+    rate: np.ndarray
+
+    def part(self, which: slice) -> "_Turning":
+        return _Turning(self.start[which], self.stop[which], self.rate[which])
+
+
 def align(track: CameraTrack, imu_time_s: np.ndarray, gyro: np.ndarray, name: str) -> Alignment:
     """Align a camera's turning with the gyroscope's.
 
@@ -96,82 +113,90 @@ def align(track: CameraTrack, imu_time_s: np.ndarray, gyro: np.ndarray, name: st
     best rotation (Kabsch 1976) over neighbouring offsets. Raises CalibrationError when the two do not move together or
     hardly turn.
     """
-    start, stop, rate = _camera_rates(track, name)
+    camera = _turning(track, name)
     integral = TurnIntegral(imu_time_s, gyro)
     # The camera's rates are noisy, the gyroscope's biased: who does not turn is told by either.
-    turning = min(_median_norm(rate), _median_norm(gyro - np.median(gyro, axis=0)))
+    turning = min(_median_norm(camera.rate), _median_norm(gyro - np.median(gyro, axis=0)))
     if turning < _LEAST_TURNING:
         raise CalibrationError(
             f"{name}: the camera hardly turns (median {np.degrees(turning):.1f} deg/s), so that its rotation and time "
             "offset to the IMU are not determined. Record with rotations about all three axes."
         )
-    coarse, correlation = _coarse_shift(start, stop, rate, integral)
+    middle = len(camera.rate) // 2
+    halves = [slice(None, middle), slice(middle, None)] if middle >= _LEAST_HALF else []
+    (coarse, correlation), *of_halves = _coarse_shifts(camera, integral, [slice(None), *halves])
+    parts = [camera.part(half) for half in halves]
     if correlation < _LEAST_CORRELATION:
-        _check_clock(start, stop, rate, integral, name)
+        _check_clock(parts, of_halves, integral, name)
         raise CalibrationError(
             f"{name}: its turning does not match the IMU's (correlation {correlation:.2f} at best, within "
             f"{_LARGEST_SHIFT_S:g} s). Are camera and IMU from the same recording, on clocks less than "
             f"{_LARGEST_SHIFT_S:g} s apart, and is the gyroscope in rad/s?"
         )
-    _check_scale(rate, integral.mean_rate(start + coarse, stop + coarse), name)
-    shift, unexplained = _fine_shift(start, stop, rate, integral, coarse)
-    _check_clock(start, stop, rate, integral, name, unexplained)
+    _check_scale(camera.rate, integral.mean_rate(camera.start + coarse, camera.stop + coarse), name)
+    shift, unexplained = _fine_shift(camera, integral, coarse)
+    _check_clock(parts, of_halves, integral, name, unexplained)
     if unexplained > _LARGEST_UNEXPLAINED:
         raise CalibrationError(
             f"{name}: its turning does not match the IMU's: the best time offset ({shift:.3f} s) and rotation leave "
             f"{100 * unexplained:.0f} % of the gyroscope's variance unexplained. Are camera and IMU from the same "
             "recording, and are the frames' corners and times right?"
         )
-    R_imu_cam, bias, _, spread = _rotation(start + shift, stop + shift, rate, integral)
-    return Alignment(shift, R_imu_cam.T, bias, correlation, spread)
+    R_imu_cam, bias, _, spread = _rotations(camera, integral, np.array([shift]))
+    return Alignment(shift, R_imu_cam[0].T, bias[0], correlation, spread[0])
 
 
-def _fine_shift(
-    start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral, coarse: float
-) -> tuple[float, float]:
+def _fine_shift(camera: _Turning, integral: TurnIntegral, coarse: float) -> tuple[float, float]:
     """The offset near `coarse` at which the best rotation leaves least, and the share of the gyroscope's variance that
     it leaves."""
-    grid = coarse + np.arange(-15, 16) * _FINE_STEP_S
-    costs = np.array([_rotation(start + s, stop + s, rate, integral)[2] for s in grid])
-    best = int(np.clip(np.argmin(costs), 1, len(grid) - 2))
-    left, middle, right = costs[best - 1 : best + 2]
-    bend = left - 2.0 * middle + right
-    shift = float(grid[best] + (0.5 * (left - right) / bend if bend > 0 else 0.0) * _FINE_STEP_S)
-    cost = _rotation(start + shift, stop + shift, rate, integral)[2]
-    measured = integral.mean_rate(start + shift, stop + shift)
+    shift, reach = coarse, _COARSE_STEP_S
+    for step in _FINE_STEPS_S:
+        steps = round(1.5 * reach / step)
+        grid = shift + np.arange(-steps, steps + 1) * step
+        costs = _rotations(camera, integral, grid)[2]
+        best = int(np.clip(np.argmin(costs), 1, len(grid) - 2))
+        left, middle, right = costs[best - 1 : best + 2]
+        bend = left - 2.0 * middle + right
+        shift = float(grid[best] + (np.clip(0.5 * (left - right) / bend, -1.0, 1.0) if bend > 0 else 0.0) * step)
+        reach = step
+    cost = float(_rotations(camera, integral, np.array([shift]))[2][0])
+    measured = integral.mean_rate(camera.start + shift, camera.stop + shift)
     return shift, cost / float(np.nansum(np.nanvar(measured, axis=0)))
 
 
 def _check_clock(
-    start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral, name: str, left: float = np.inf
+    parts: Sequence[_Turning],
+    coarse: Sequence[tuple[float, float]],
+    integral: TurnIntegral,
+    name: str,
+    left: float = np.inf,
 ) -> None:
     """Raise CalibrationError when the offset that serves the first half of the recording is not that of the second, and
-    one offset for both leaves clearly more unexplained (`left`) than two do."""
-    middle = len(rate) // 2
-    if middle < _LEAST_HALF:
-        return
+    one offset for both leaves clearly more unexplained (`left`) than two do.
+
+    `parts` are the halves, or nothing where they are too short; `coarse`, the `_coarse_shifts` of each.
+    """
     shifts = []
-    for half in (slice(None, middle), slice(middle, None)):
-        coarse, correlation = _coarse_shift(start[half], stop[half], rate[half], integral)
+    for part, (about, correlation) in zip(parts, coarse, strict=True):
         if correlation < _LEAST_CORRELATION:
             return  # a half that tells nothing by itself
-        shift, unexplained = _fine_shift(start[half], stop[half], rate[half], integral, coarse)
+        shift, unexplained = _fine_shift(part, integral, about)
         if unexplained > min(_CLEARLY_EXPLAINED, _WORTH_TWO * left):
             return
         shifts.append(shift)
-    if abs(shifts[1] - shifts[0]) > _LARGEST_JUMP_S:
+    if shifts and abs(shifts[1] - shifts[0]) > _LARGEST_JUMP_S:
         raise CalibrationError(
             f"{name}: its clock and the IMU's do not run together: the time offset is {shifts[0]:.4f} s in the first "
-            f"half of the frames (up to {start[middle]:.1f} s after the IMU's first sample) and {shifts[1]:.4f} s in "
-            "the second. A clock jumped or drifts, or samples were lost and the others numbered on. Take the time "
+            f"half of the frames (up to {parts[1].start[0]:.1f} s after the IMU's first sample) and {shifts[1]:.4f} s "
+            "in the second. A clock jumped or drifts, or samples were lost and the others numbered on. Take the time "
             "stamps from the sensors' own clocks, or calibrate from the part of the recording before the jump."
         )
 
 
 def turning(track: CameraTrack, name: str) -> tuple[np.ndarray, np.ndarray]:
     """A camera's rate of turn, as a gyroscope would have it: times (n,) between its frames, and rad/s (n, 3)."""
-    start, stop, rate = _camera_rates(track, name)
-    return 0.5 * (start + stop), rate
+    camera = _turning(track, name)
+    return 0.5 * (camera.start + camera.stop), camera.rate
 
 
 def _median_norm(vectors: np.ndarray) -> float:
@@ -190,8 +215,8 @@ def _check_scale(camera: np.ndarray, imu: np.ndarray, name: str) -> None:
         )
 
 
-def _camera_rates(track: CameraTrack, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spans between consecutive frames (start, stop) and the mean rate of turn in each, camera frame."""
+def _turning(track: CameraTrack, name: str) -> _Turning:
+    """The mean rates of turn between consecutive frames."""
     step = np.diff(track.time_s)
     near = step < _LONGEST_STEP_S
     if near.sum() < 10:
@@ -201,59 +226,102 @@ def _camera_rates(track: CameraTrack, name: str) -> tuple[np.ndarray, np.ndarray
         )
     relative = track.rotation[:-1].swapaxes(-1, -2) @ track.rotation[1:]
     rate = Rotation.from_matrix(relative[near]).as_rotvec() / step[near, None]
-    return track.time_s[:-1][near], track.time_s[1:][near], rate
+    return _Turning(track.time_s[:-1][near], track.time_s[1:][near], rate)
 
 
-def _coarse_shift(start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral) -> tuple[float, float]:
-    """Offset with the largest correlation of rate magnitudes over at least half of the spans.
+def _coarse_shifts(camera: _Turning, integral: TurnIntegral, parts: Sequence[slice]) -> list[tuple[float, float]]:
+    """For each of `parts` of the spans, the offset with the largest correlation of rate magnitudes over at least half
+    of them, and that correlation: (0, -1) where there is none.
 
     The gyroscope's turning is laid out once on a grid finer than the offsets tried, for each length of span that there
     is, so that to try an offset is to look up.
     """
-    magnitude = np.minimum(np.linalg.norm(rate, axis=1), 20.0)
+    magnitude = _normalised(np.minimum(np.linalg.norm(camera.rate, axis=1), 20.0))
     fine = _COARSE_STEP_S / _GRID_PER_STEP
-    spans, which = np.unique(np.maximum(np.round((stop - start) / fine).astype(np.int64), 1), return_inverse=True)
-    turning = integral.turning_on_grid(fine, spans)
-    size = turning.shape[1]
-    place = np.round((start - integral.start_s) / fine).astype(np.int64)
-    best = (0.0, -1.0)
+    spans, which = np.unique(
+        np.maximum(np.round((camera.stop - camera.start) / fine).astype(np.int64), 1), return_inverse=True
+    )
+    turning = _normalised(integral.turning_on_grid(fine, spans))
+    place = np.round((camera.start - integral.start_s) / fine).astype(np.int64)
     most = round(_LARGEST_SHIFT_S / _COARSE_STEP_S)
-    for k in range(-most, most + 1):
-        at = place + k * _GRID_PER_STEP
-        within = (at >= 0) & (at < size)
-        other = np.where(within, turning[which, np.where(within, at, 0)], np.nan)
-        inside = np.isfinite(other)
-        count = np.count_nonzero(inside)
-        if count < 0.5 * len(magnitude):
-            continue
-        a, b = (magnitude, other) if count == len(other) else (magnitude[inside], other[inside])
-        a, b = a - a.sum() / count, b - b.sum() / count
-        spread = np.sqrt((a @ a) * (b @ b))
-        correlation = float(a @ b / spread) if spread > 0 else 0.0
-        # Among equals the smaller offset is the likelier.
-        if correlation > best[1] + 1e-9:
-            best = (k * _COARSE_STEP_S, correlation)
-    return best
+    steps = np.arange(-most, most + 1)
+    correlations = np.concatenate(
+        [
+            _correlations(magnitude, turning, which, place + some[:, None] * _GRID_PER_STEP, parts)
+            for some in np.array_split(steps, math.ceil(len(steps) / _SHIFTS_AT_ONCE))
+        ],
+        axis=1,
+    )
+    # Among equals the first offset.
+    best = [int(np.argmax(row >= row.max() - 1e-9)) for row in correlations]
+    return [
+        (float(steps[k]) * _COARSE_STEP_S, float(row[k])) if row[k] > -1.0 else (0.0, -1.0)
+        for k, row in zip(best, correlations, strict=True)
+    ]
 
 
-def _rotation(
-    start: np.ndarray, stop: np.ndarray, rate: np.ndarray, integral: TurnIntegral
-) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """R_imu_cam, gyro bias, trimmed cost and excitation of the best rotation between rates, worst fifth left out."""
-    measured = integral.mean_rate(start, stop)
-    inside = np.isfinite(measured[:, 0])
-    camera, imu = rate[inside], measured[inside]
-    kept = np.ones(len(camera), dtype=bool)
-    R, bias, error, values = np.eye(3), np.zeros(3), np.zeros(len(camera)), np.zeros(3)
+def _normalised(values: np.ndarray) -> np.ndarray:
+    """Values less their mean, in units of their root mean square; NaN stay so."""
+    known = values[np.isfinite(values)]
+    if len(known) == 0:
+        return values
+    return (values - known.mean()) / max(float(np.sqrt(np.mean(known**2))), 1e-30)
+
+
+def _correlations(
+    magnitude: np.ndarray, turning: np.ndarray, which: np.ndarray, at: np.ndarray, parts: Sequence[slice]
+) -> np.ndarray:
+    """Correlation (P, K) of each part of `magnitude` (n,) with what the table `turning` (S, G) holds in the rows
+    `which` (n,) at the places `at` (K, n), both normalised; -1 where less than half of a part lies within the table."""
+    within = (at >= 0) & (at < turning.shape[1])
+    other = turning[which, np.where(within, at, 0)].astype(np.float64)
+    inside = within & np.isfinite(other)
+    other = np.where(inside, other, 0.0)
+    out = np.full((len(parts), len(at)), -1.0)
+    for row, part in zip(out, parts, strict=True):
+        a, b, count = magnitude[part], other[:, part], np.count_nonzero(inside[:, part], axis=1)
+        enough = (count >= 0.5 * len(a)) & (count > 0)
+        b, seen, count = b[enough], inside[enough, part], count[enough]
+        sum_a, sum_b = seen @ a, b.sum(axis=1)
+        spread_a = seen @ a**2 - sum_a**2 / count
+        spread_b = np.einsum("kn,kn->k", b, b) - sum_b**2 / count
+        # What does not vary beyond rounding correlates with nothing.
+        least = _ROUNDING**2 * count
+        row[enough] = (b @ a - sum_a * sum_b / count) / np.sqrt(
+            np.maximum(spread_a, least) * np.maximum(spread_b, least)
+        )
+    return out
+
+
+def _rotations(
+    camera: _Turning, integral: TurnIntegral, shifts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """R_imu_cam (S, 3, 3), gyro bias (S, 3), trimmed cost (S,) and excitation (S, 3) of the best rotation between rates
+    at each offset, the worst fifth left out."""
+    measured = integral.mean_rate(camera.start + shifts[:, None], camera.stop + shifts[:, None])
+    inside = np.isfinite(measured[..., 0])
+    imu = np.where(inside[..., None], measured, 0.0)
+    last = np.count_nonzero(inside, axis=1) - 1
+    below = np.floor(_TRIM * last).astype(np.int64)
+    rows, above, share = np.arange(len(shifts)), np.minimum(below + 1, last), _TRIM * last - below
+    kept = inside
+    R, bias = np.zeros((len(shifts), 3, 3)), np.zeros((len(shifts), 3))
+    error, values = np.zeros(inside.shape), np.zeros((len(shifts), 3))
     for _ in range(4):
-        mean_camera, mean_imu = camera[kept].mean(axis=0), imu[kept].mean(axis=0)
-        covariance = (imu[kept] - mean_imu).T @ (camera[kept] - mean_camera)
-        u, values, vt = np.linalg.svd(covariance)
-        R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        bias = mean_imu - R @ mean_camera
-        error = np.sum((imu - camera @ R.T - bias) ** 2, axis=1)
-        kept = error <= np.quantile(error, _TRIM)
-    return R, bias, float(np.mean(error[kept])), np.sqrt(values / max(kept.sum(), 1))
+        weight = kept / np.count_nonzero(kept, axis=1)[:, None]
+        mean_camera, mean_imu = weight @ camera.rate, np.einsum("sn,snj->sj", weight, imu)
+        products = (imu * weight[..., None]).swapaxes(1, 2) @ camera.rate
+        u, values, vt = np.linalg.svd(products - mean_imu[:, :, None] * mean_camera[:, None])
+        u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+        R = u @ vt
+        bias = mean_imu - np.einsum("sij,sj->si", R, mean_camera)
+        difference = imu - camera.rate @ R.swapaxes(1, 2) - bias[:, None]
+        error = np.where(inside, np.einsum("snj,snj->sn", difference, difference), np.inf)
+        ordered = np.sort(error, axis=1)
+        limit = ordered[rows, below] * (1.0 - share) + ordered[rows, above] * share
+        kept = error <= limit[:, None]
+    cost = np.where(kept, error, 0.0).sum(axis=1) / np.count_nonzero(kept, axis=1)
+    return R, bias, cost, np.sqrt(values)
 
 
 def orientation_track(time_s: np.ndarray, rotation: np.ndarray, imu_time_s: np.ndarray, gyro: np.ndarray) -> np.ndarray:

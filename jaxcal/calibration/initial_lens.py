@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxcal.calibration import generic_lens
 from jaxcal.calibration.assemble import CameraFrames
-from jaxcal.calibration.first_fit import Fit, Lens, Views, compact_views, fit_lenses, squared_errors
+from jaxcal.calibration.first_fit import FREE_DAMPING, Fit, Lens, Views, compact_views, fit_lenses, squared_errors
 from jaxcal.calibration.generic_lens import GenericLens
 from jaxcal.calibration.generic_search import Found, generic_candidates, spread_views, trimmed_rms
 from jaxcal.calibration.lens_poses import HUBER_PX, swap_mirrored
@@ -157,7 +157,8 @@ def _sharpened(fit: Fit, views: Views, start: CameraModel, far: float) -> tuple[
     lens = ModelLens(start)
     median = float(np.sqrt(np.median(squared_errors(lens, fit, views, far)[0][views.weight > 0])))
     width = float(np.clip(2.5 * median, 0.1, HUBER_PX))
-    fit = fit_lenses(lens, fit, views, steps=20, width=width, cap=far, prior=_model_prior(start))
+    # From one optimum to another nearby.
+    fit = fit_lenses(lens, fit, views, steps=20, width=width, cap=far, prior=_model_prior(start), damping=FREE_DAMPING)
     return start.with_parameters(fit.parameters[0]), trimmed_rms(lens, fit, views, far)
 
 

@@ -1,12 +1,22 @@
 """Poses of a flat board through a lens that is given, the better of the two that such a board allows."""
 
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from jaxcal.calibration import generic_lens
 from jaxcal.calibration.assemble import CameraFrames
-from jaxcal.calibration.first_fit import Fit, Lens, Views, compact_views, fit_lenses, fit_poses, squared_errors
+from jaxcal.calibration.first_fit import (
+    Fit,
+    Lens,
+    Views,
+    compact_views,
+    fit_lenses,
+    fit_poses,
+    hopeless,
+    squared_errors,
+)
 from jaxcal.calibration.generic_lens import GenericLens
 from jaxcal.calibration.initial_poses import mirrored_poses, planar_poses
 from jaxcal.calibration.model_lens import ModelLens
@@ -105,15 +115,21 @@ def better_of_mirrored(lens: Lens, fit: Fit, cost: np.ndarray, views: Views, siz
     )
     rotation, translation = mirrored_poses(fit.rotation, fit.translation, middle)
     other = Fit(fit.parameters, rotation, translation, fit.cost)
-    other, other_cost = fit_poses(lens, other, views, steps=_POSE_STEPS, width=HUBER_PX, cap=0.25 * size, beat=cost)
-    swap = other_cost < cost - 1e-9 * np.abs(cost)
-    merged = Fit(
-        fit.parameters,
-        np.where(swap[..., None, None], other.rotation, fit.rotation),
-        np.where(swap[..., None], other.translation, fit.translation),
-        np.where(swap, other_cost, cost).sum(axis=-1),
+    limits = {"width": HUBER_PX, "cap": 0.25 * size}
+    rivals = np.flatnonzero(~hopeless(lens, other, fit, views, **limits))
+    swap = np.zeros(cost.shape, dtype=bool)
+    if len(rivals) == 0:
+        return dataclasses.replace(fit, cost=cost.sum(axis=-1)), swap
+    before = cost[:, rivals]
+    other, found = fit_poses(
+        lens, other.take_views(rivals), views.take(rivals), steps=_POSE_STEPS, beat=before, **limits
     )
-    return merged, swap
+    swap[:, rivals] = better = found < before - 1e-9 * np.abs(before)
+    rotation, translation, cost = fit.rotation.copy(), fit.translation.copy(), cost.copy()
+    rotation[:, rivals] = np.where(better[..., None, None], other.rotation, rotation[:, rivals])
+    translation[:, rivals] = np.where(better[..., None], other.translation, translation[:, rivals])
+    cost[:, rivals] = np.where(better, found, before)
+    return Fit(fit.parameters, rotation, translation, cost.sum(axis=-1)), swap
 
 
 def swap_mirrored(lens: Lens, fit: Fit, views: Views, far: float) -> tuple[Fit, bool]:

@@ -1,14 +1,13 @@
-"""The damped Gauss-Newton step through the block-arrow factorisation, as an optimistix descent."""
-
-from typing import Any
+"""The damped Gauss-Newton step through the block-arrow factorisation."""
 
 import equinox as eqx
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from jaxcal.estimation.block_arrow import BlockArrow, factorise
 
+# Of the first step, where it is not known how near the optimum is.
+FIRST_DAMPING = 1e-4
 # A parameter that nothing constrains has a zero diagonal; it is damped by this fraction of the largest.
 _SMALLEST_DIAGONAL = 1e-14
 
@@ -32,17 +31,3 @@ def damped_step(equations: BlockArrow, damping: Float[Array, ""]) -> BlockStep:
     slope = jnp.sum(equations.gradient_chain * chain) + equations.gradient_shared @ shared
     damped = jnp.sum(damping_chain * chain**2) + damping_shared @ shared**2
     return BlockStep(chain, shared, -0.5 * slope + 0.5 * damped)
-
-
-class BlockArrowDescent(optx.AbstractDescent):
-    """`optimistix` descent whose query state is the block-arrow normal equations and whose step size is 1/damping."""
-
-    def init(self, y: Any, f_info_struct: Any) -> BlockArrow:
-        return f_info_struct
-
-    def query(self, y: Any, f_info: Any, state: BlockArrow) -> BlockArrow:
-        return f_info
-
-    def step(self, step_size: Float[Array, ""], state: BlockArrow) -> tuple[BlockStep, optx.RESULTS]:
-        """The step for damping 1 / `step_size`."""
-        return damped_step(state, 1.0 / step_size), optx.RESULTS.successful
