@@ -130,7 +130,7 @@ def _equations_of_less(
     """The equations at the optimum with each camera's corners and each IMU's samples counting as much as they tell."""
     if max(effects) == 1.0 and all((effect == 1.0).all() for effect in imu_effects):
         return fit.result.equations
-    if fit.problem.imu is not None:
+    if fit.problem.imu is not None and fit.problem.imu.samples:  # a trajectory may be of cameras alone
         samples = zip(fit.problem.imu.samples, imu_effects, strict=True)
         inverse = [own.inverse_sigma / on_device(np.sqrt(np.repeat(effect, 3))) for own, effect in samples]
         problem = eqx.tree_at(lambda p: [own.inverse_sigma for own in p.imu.samples], fit.problem, inverse)

@@ -142,6 +142,19 @@ def test_euroc_cameras_without_the_imu(data_folder: Path) -> None:
     assert baseline == pytest.approx(0.11007, abs=1e-3)
 
 
+def test_euroc_cameras_turn_out_to_be_synchronised(data_folder: Path) -> None:
+    """One clock triggers both; each of them errs by more than noise, so that sigmas are made larger."""
+    detections, _, target = _euroc(data_folder)
+    start = min(int(d.timestamps_ns[0]) for d in detections)
+    part = [d.of_frames(d.timestamps_ns < start + 10_000_000_000) for d in detections]
+    calibration = calibrate_cameras(part, target, time_offsets=True)
+    offset = calibration.cameras[1].timeshift_cam_cam0
+    assert offset is not None
+    (sigma,) = calibration.std("cam1.timeshift_cam_cam0")
+    log.info("offset %.1f us, sigma %.1f us", 1e6 * offset, 1e6 * sigma)
+    assert abs(offset) < 3.0 * sigma < 1e-3
+
+
 def test_kalibrs_own_corners_give_at_most_kalibrs_errors(data_folder: Path) -> None:
     """Kalibr errs by 0.0109 deg, 0.195 mm and 6.9 us on these corners."""
     folder = data_folder / "kalibr_sim_mono_imu"
