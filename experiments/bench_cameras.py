@@ -41,9 +41,10 @@ from jaxcal import Checkerboard, Detections
 from jaxcal.calibration import solving
 from jaxcal.calibration.assemble import CameraFrames, camera_frames
 from jaxcal.calibration.problem import RigProblem
+from jaxcal.calibration.robust import START_DAMPING
 from jaxcal.calibration.state import RigState
 from jaxcal.cameras import PinholeRadtan
-from jaxcal.estimation import single_threaded_blas, solve, solve_inside
+from jaxcal.estimation import SolveResult, single_threaded_blas, solve, solve_inside
 
 BOARD = Checkerboard(rows=12, cols=12, spacing=0.04)
 SIZE = (752, 480)
@@ -154,6 +155,11 @@ def opencv_inputs(frames: CameraFrames) -> tuple[list[np.ndarray], list[np.ndarr
     return points, pixels
 
 
+def optimised(case: Case) -> SolveResult:
+    """The optimum from the common start, with the first steps of `calibrate_cameras`."""
+    return solve(case.problem, case.state, damping=START_DAMPING)
+
+
 def start_matrix() -> np.ndarray:
     """The start's camera matrix (3, 3), for OpenCV."""
     return np.array([[START[0], 0, START[2]], [0, START[1], START[3]], [0, 0, 1.0]])
@@ -175,7 +181,7 @@ def bench_mono() -> None:
         inputs = opencv_inputs(case.cameras[0])
         (ours, result), (theirs, cost) = timed_in_turn(
             [
-                lambda case=case: solve(case.problem, case.state),
+                lambda case=case: optimised(case),
                 lambda inputs=inputs: calibrate_opencv(*inputs),
             ],
             MONO_REPEATS,
@@ -189,7 +195,7 @@ def bench_rig() -> None:
     """Four cameras, 200 and 1000 views, beside Ceres and OpenCV 5."""
     for views in (200, 1000):
         case = make_case(views, 4)
-        ours, result = timed(lambda case=case: solve(case.problem, case.state))
+        ours, result = timed(lambda case=case: optimised(case))
         steps = f"{int(result.iterations)} iterations"
         report(f"jaxcal, 4 cameras x {views} views", ours, float(result.equations.cost), None, steps)
         _bench_ceres(case, views, ours)
@@ -272,7 +278,7 @@ def bench_batch() -> None:
     def all_of_them(problem: RigProblem, state: RigState, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
         def one(shift: jax.Array) -> tuple[jax.Array, jax.Array]:
             moved = eqx.tree_at(lambda p: p.corners[0].pixels, problem, problem.corners[0].pixels + shift)
-            result = solve_inside(moved, state)
+            result = solve_inside(moved, state, damping=START_DAMPING)
             return result.state.lenses[0][0], result.equations.cost
 
         return jax.lax.map(one, noise)
@@ -344,7 +350,7 @@ def bench_memory() -> None:
     for views in (100, 1000, 4000):
         code = (
             f"import sys; sys.path.insert(0, {FOLDER!r}); import bench_cameras as b; "
-            f"case = b.make_case({views}, 1); b.solve(case.problem, case.state); print(b.peak_mib())"
+            f"case = b.make_case({views}, 1); b.optimised(case); print(b.peak_mib())"
         )
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         print(f"| peak memory, one camera x {views} views | | | | | | {float(done.stdout):.0f} MiB |", flush=True)

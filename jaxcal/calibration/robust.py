@@ -16,7 +16,7 @@ from jaxcal.calibration.redundancy import Redundancy, measure_redundancy
 from jaxcal.calibration.state import RigState
 from jaxcal.calibration.view_noise import all_alike, weigh_views
 from jaxcal.errors import CalibrationError
-from jaxcal.estimation import FIRST_DAMPING, SolveResult, on_device, solve
+from jaxcal.estimation import SolveResult, on_device, solve
 from jaxcal.progress import Progress
 
 logger = logging.getLogger(__name__)
@@ -28,9 +28,11 @@ _PLAIN = 3
 # All rounds but the last only find the noise and the outliers: they end when a step promises less than this share of
 # the cost, which is a hundredth of a sigma in each of a thousand parameters.
 _ENOUGH_FOR_NOISE = 1e-5
-# The first step of a round that starts at the optimum of the one before is hardly damped; nor is any of a trajectory's:
-# damping counts in units of the Hessian's diagonal, which for dense control points is that of one shaking against its
-# neighbours, and holds back what they do together, which counts for far less.
+# A first lens and its poses are near: the first step may be damped less than one from anywhere. That of a round that
+# starts at the optimum of the one before is hardly damped; nor is any of a trajectory's: damping counts in units of the
+# Hessian's diagonal, which for dense control points is that of one shaking against its neighbours, and holds back what
+# they do together, which counts for far less.
+START_DAMPING = 1e-6
 _NEXT_DAMPING, _TRAJECTORY_DAMPING = 1e-7, 1e-10
 
 # Adapts a problem to the residuals found so far (re-weights its IMU, say) before a round.
@@ -121,7 +123,7 @@ def robust_fit(
 def _first_damping(problem: RigProblem, stage: int) -> float:
     if problem.imu is not None:
         return _TRAJECTORY_DAMPING
-    return FIRST_DAMPING if stage == 0 else _NEXT_DAMPING
+    return START_DAMPING if stage == 0 else _NEXT_DAMPING
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from jaxcal.estimation.block_arrow import BlockArrow, factorise
 
 # Of the first step, where it is not known how near the optimum is.
-FIRST_DAMPING = 1e-6
+FIRST_DAMPING = 1e-4
 # A parameter that nothing constrains has a zero diagonal; it is damped by this fraction of the largest.
 _SMALLEST_DIAGONAL = 1e-14
 
