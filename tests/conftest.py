@@ -14,9 +14,9 @@ from jaxcal.programs import forget_programs
 _VARIABLE = "XLA_FLAGS"
 _FEW_PASSES = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
 
-# Most of the suite's time is XLA's compiler at work on programs that run once or twice; with fewer passes it takes half
-# of it. Set here, and so inherited by pytest-xdist's processes, in which XLA has read it before they come to this file
-# (as it has here: a run in one process compiles as usual).
+# Most of the suite's time is XLA's compiler at work on programs that run once or twice; with fewer passes the suite
+# took 25 minutes in place of 31. Set here, and so inherited by pytest-xdist's processes, in which XLA has read it
+# before they come to this file (as it has here: a run in one process compiles as usual).
 if not os.environ.get(_VARIABLE, "").startswith(_FEW_PASSES):
     os.environ[_VARIABLE] = _FEW_PASSES + os.environ.get(_VARIABLE, "")
 

@@ -183,7 +183,7 @@ def hopeless(lens: Lens, rival: Fit, fit: Fit, views: Views, *, width: float, ca
     few = views.thinned(_FIRST_CORNERS)
     cost = fit_poses(lens, fit, few, steps=0, width=width, cap=cap)[1]
     others = fit_poses(lens, rival, few, steps=_FAIR_STEPS, width=width, cap=cap)[1]
-    return (others > _HOPELESS * cost).all(axis=0)
+    return np.all(others > _HOPELESS * cost, axis=0)
 
 
 def fit_lenses(

@@ -67,18 +67,22 @@ def solve_inside(
 
     from jaxcal.estimation.levenberg_marquardt import BlockArrowLevenbergMarquardt, NoAdjoint
 
+    # Not typed: their classes are known from here on only.
+    chosen: Any = solver or BlockArrowLevenbergMarquardt()
+    derivatives: Any = adjoint or NoAdjoint()
+
     # optimistix traces the residual function, which this solver never evaluates: it works on normal equations.
     def untouched(y: State, args: Any) -> Array:
         return jnp.zeros(1)
 
     solution = optx.least_squares(
         untouched,
-        solver or BlockArrowLevenbergMarquardt(),
+        chosen,
         state,
         options={"problem": problem, "max_steps": max_steps, "rtol": rtol, "damping": damping},
         max_steps=None,
         throw=False,
-        adjoint=adjoint or NoAdjoint(),
+        adjoint=derivatives,
     )
     stats = solution.stats
     return SolveResult(solution.value, stats["equations"], stats["history"], stats["iterations"], stats["converged"])
